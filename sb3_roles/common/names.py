@@ -1,0 +1,19 @@
+"""Messages for names that are not known."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+def closest(what: str, name: object, allowed: Iterable[str]) -> str:
+    """One line for an unknown name: what is allowed, and the closest match.
+
+    :param what: the kind of thing that was named
+    :param name: the unknown name
+    :param allowed: the known names
+    """
+    known = list(allowed)
+    close = difflib.get_close_matches(str(name), known, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"unknown {what} {name!r}: allowed are {', '.join(known) or 'none'}{hint}"

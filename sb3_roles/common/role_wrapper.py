@@ -1,0 +1,204 @@
+"""``RoleWrapper``: the hierarchy as an environment whose actions are (role, primitive action)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_roles.common import roles as role_registry
+from sb3_roles.common.names import closest
+from sb3_roles.common.roles import Role, get_roles, weight_vector
+from sb3_roles.common.team_wrapper import TeamWrapper
+
+ROLE_KEY = "role"
+ROLE_DUE_KEY = "role_due"
+REWARD_SHARING = ("own", "same_role", "team")
+STREAMS = ("role", "primitive")
+
+
+class RoleWrapper(TeamWrapper):
+    """Actions ``MultiDiscrete([n_roles, n_primitives])``, and a reward for each of the two levels.
+
+    The base environment gets the primitive action and knows nothing of roles. The reward of a row
+    is the role reward, R = alpha R_e + beta R_c for area search (Eq. 2); ``stream_rewards``,
+    float32 (num_envs, 2), holds the role reward and the primitive reward (Eq. 6) of the last step.
+
+    Observations get two more keys: ``role``, float32 (n_roles,), the role of the last step as a
+    one-hot (all 0 at the start of an episode), and ``role_due``, float32 (1,): 1 when the role
+    policy decides in this step, 0 when the role in ``role`` goes on. The role policy decides every
+    ``role_every`` steps of an episode. A controlled role (fixed or random) is never due.
+
+    :param venv: an environment of ``make_team_vec_env``, possibly wrapped, with discrete actions
+    :param roles: names of the role registry, or roles
+    :param role_weights: weights of the reward components in the role reward; by default 1 for each
+    :param primitive_weights: ``"identity"`` (the paper), ``"role_reward"`` (the released code), or
+        for each role the weights by component
+    :param reward_sharing: whose components a robot is paid: ``"own"``, those of the robots that act
+        in its role (``"same_role"``, the paper), or of the whole ``"team"``
+    :param role_every: steps that a role lasts
+    :param role_control: ``"learned"``, ``"random"`` (uniform, every ``role_every`` steps) or the
+        name of the role that all robots act in
+    :param seed: seed of the random roles
+    :raises ValueError: if an option is unknown or out of range, or the actions are not discrete
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        roles: Sequence[str | Role] = ("explore", "cover"),
+        role_weights: Mapping[str, float] | None = None,
+        primitive_weights: str | Mapping[str, Mapping[str, float]] = "identity",
+        reward_sharing: str = "own",
+        role_every: int = 1,
+        role_control: str = "learned",
+        seed: int = 0,
+    ) -> None:
+        self.roles = get_roles(roles)
+        self.role_names = tuple(role.name for role in self.roles)
+        if reward_sharing not in REWARD_SHARING:
+            raise ValueError(closest("reward_sharing", reward_sharing, REWARD_SHARING))
+        if isinstance(role_every, bool) or not isinstance(role_every, int) or role_every < 1:
+            raise ValueError(f"role_every must be a whole number from 1, got {role_every!r}")
+        controls = ("learned", "random", *self.role_names)
+        if role_control not in controls:
+            raise ValueError(closest("role_control", role_control, controls))
+        super().__init__(venv)
+        if not isinstance(venv.action_space, spaces.Discrete):
+            raise ValueError(f"roles need discrete actions, got {venv.action_space}")
+        self.action_space = spaces.MultiDiscrete([len(self.roles), int(venv.action_space.n)])
+        # An environment without components has one: its reward, which every role is paid.
+        self.components = self.team_env.component_names or ("reward",)
+        if not self.team_env.component_names:
+            self.roles = tuple(Role(role.name, "reward", role.goal_set) for role in self.roles)
+        by_role = dict.fromkeys(self.components, 1.0) if role_weights is None else role_weights
+        self._role_weights = weight_vector("role_weights", by_role, self.components)
+        self._primitive_weights = role_registry.primitive_weights(
+            primitive_weights, self.roles, self.components, self._role_weights
+        )
+        self.reward_sharing = reward_sharing
+        self.role_every = role_every
+        self.role_control = role_control
+        self._rng = np.random.default_rng(seed)
+        self.current_roles = np.full(self.num_envs, -1, np.int64)
+        self._episode_steps = np.zeros(self.num_envs, np.int64)
+        self.stream_rewards = np.zeros((self.num_envs, len(STREAMS)), np.float32)
+
+    def _extra_spaces(self) -> dict[str, spaces.Space]:
+        return {
+            ROLE_KEY: spaces.Box(0.0, 1.0, (len(self.roles),), np.float32),
+            ROLE_DUE_KEY: spaces.Box(0.0, 1.0, (1,), np.float32),
+        }
+
+    def _extra_observations(self) -> dict[str, np.ndarray]:
+        due = self._episode_steps % self.role_every == 0
+        if self.role_control != "learned":
+            due = np.zeros_like(due)
+        one_hot = self.current_roles[:, None] == np.arange(len(self.roles))
+        return {
+            ROLE_KEY: one_hot.astype(np.float32),
+            ROLE_DUE_KEY: due[:, None].astype(np.float32),
+        }
+
+    def _control_roles(self) -> None:
+        """Set the roles that are not learned, for the coming step."""
+        if self.role_control == "learned":
+            return
+        if self.role_control == "random":
+            drawn = self._rng.integers(len(self.roles), size=self.num_envs)
+            due = self._episode_steps % self.role_every == 0
+            self.current_roles = np.where(due, drawn, self.current_roles)
+        else:
+            self.current_roles[:] = self.role_names.index(self.role_control)
+
+    def reset(self) -> dict[str, np.ndarray]:
+        """Start new episodes, without a role yet.
+
+        :return: observations, rows (n_teams * n_agents, ...)
+        """
+        self.current_roles = np.full(self.num_envs, -1, np.int64)
+        self._episode_steps[:] = 0
+        self.stream_rewards = np.zeros_like(self.stream_rewards)
+        observations = self.venv.reset()
+        self._control_roles()
+        return self._extend(observations)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Hand the primitive actions to the environment.
+
+        :param actions: integer (num_envs, 2), role and primitive action of each row
+        :raises ValueError: if the shape is wrong, or a role is not the one that goes on
+        """
+        actions = np.asarray(actions)
+        if actions.shape != (self.num_envs, 2):
+            raise ValueError(
+                f"actions must have shape ({self.num_envs}, 2): role and primitive action of each "
+                f"row, got {actions.shape}"
+            )
+        roles = actions[:, 0].astype(np.int64)
+        held = self._extra_observations()[ROLE_DUE_KEY][:, 0] == 0
+        if np.any(held & (roles != self.current_roles)):
+            row = int(np.flatnonzero(held & (roles != self.current_roles))[0])
+            raise ValueError(
+                f"row {row} acts in role {roles[row]}, but its role {self.current_roles[row]} goes "
+                "on: where role_due is 0 a policy must keep the role of the observation"
+            )
+        self.current_roles = roles
+        self.venv.step_async(actions[:, 1])
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Finish the step.
+
+        :return: observations, role rewards float32 (num_envs,), dones, infos
+        """
+        observations, rewards, dones, infos = self.venv.step_wait()
+        components = (
+            self.team_env.reward_components if self.team_env.component_names else rewards[:, None]
+        )
+        shared = self._share(components)
+        weights = self._primitive_weights[self.current_roles]
+        self.stream_rewards = np.stack(
+            [shared @ self._role_weights, (shared * weights).sum(axis=1)], axis=1
+        ).astype(np.float32)
+        self._episode_steps += 1
+        self._extend_terminal(infos)
+        self._episode_steps[dones] = 0
+        self.current_roles = np.where(dones, -1, self.current_roles)
+        self._control_roles()
+        return self._extend(observations), self.stream_rewards[:, 0].copy(), dones, infos
+
+    def _share(self, components: np.ndarray) -> np.ndarray:
+        """Sum each row's components over the robots whose reward it shares.
+
+        :param components: float32 (num_envs, n_components)
+        :return: float32, the same shape
+        """
+        if self.reward_sharing == "own":
+            return components
+        team = components.reshape(self.n_teams, self.n_agents, -1)
+        if self.reward_sharing == "team":
+            shared = np.broadcast_to(team.sum(axis=1, keepdims=True), team.shape)
+        else:
+            member = self.current_roles.reshape(self.n_teams, self.n_agents)
+            one_hot = (member[:, :, None] == np.arange(len(self.roles))).astype(np.float32)
+            by_role = np.einsum("tar,tac->trc", one_hot, team)
+            shared = np.einsum("tar,trc->tac", one_hot, by_role)
+        return shared.reshape(components.shape)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what the coming steps depend on, apart from the environment's own state."""
+        return {
+            "current_roles": self.current_roles.copy(),
+            "episode_steps": self._episode_steps.copy(),
+            "generator": self._rng.bit_generator.state,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from what :meth:`get_state` returned."""
+        self.current_roles = np.array(state["current_roles"], np.int64)
+        self._episode_steps[:] = state["episode_steps"]
+        self._rng.bit_generator.state = state["generator"]
