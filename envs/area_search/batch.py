@@ -216,7 +216,9 @@ class BatchedAreaSearch:
             )
 
     def reset(
-        self, seed: int | Sequence[int] | np.ndarray, episode: int | Sequence[int] | np.ndarray | None = None
+        self,
+        seed: int | Sequence[int] | np.ndarray,
+        episode: int | Sequence[int] | np.ndarray | None = None,
     ) -> None:
         """Start an episode in every team.
 
@@ -295,8 +297,8 @@ class BatchedAreaSearch:
             )
         if actions.dtype.kind not in "iu":
             raise ValueError(f"actions must be whole numbers, got {actions.dtype}")
-        # One integer type, so that the kernels are compiled once.
-        actions = actions.astype(np.int64, copy=False)
+        # One type and layout, so that the kernels are compiled once.
+        actions = np.ascontiguousarray(actions, np.int64)
         wrong = kernels.first_invalid(actions, N_ACTIONS)
         if wrong >= 0:
             value = actions.flat[wrong]

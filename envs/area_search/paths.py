@@ -80,7 +80,7 @@ def _search(
     cells: np.ndarray,
     stride: int,
     start: int,
-    n_goal_sets: np.ndarray,
+    n_goals: np.ndarray,
     everything: bool,
     distance: np.ndarray,
     moves: np.ndarray,
@@ -91,9 +91,9 @@ def _search(
 
     :param cells: uint8 (n,), the padded map, flat
     :param stride: cells per padded row
-    :param n_goal_sets: int64 (2,), frontier cells and known targets there are; a set that is empty
+    :param n_goals: int64 (2,), frontier cells and known targets there are; a set that is empty
         is not searched for
-    :param everything: visit all reachable cells; else stop behind the nearest goal of each set
+    :param everything: stop behind the last goal; else behind the nearest goal of each set
     :param distance: int32 (n,), written for visited cells
     :param moves: uint8 (n,), all 0 before; written for visited cells: bit ``a`` is set when a
         shortest path there can start with action ``a`` (bit 0: the robot is there)
@@ -108,9 +108,10 @@ def _search(
     distance[start] = 0
     queue[0] = start
     head, tail = 0, 1
-    wanted = (n_goal_sets[0] > 0) + (n_goal_sets[1] > 0)
+    wanted = (n_goals[0] > 0) + (n_goals[1] > 0)
+    left = n_goals[0] + n_goals[1]
     last = -1
-    while head < tail:
+    while head < tail and left > 0:
         cell = queue[head]
         d = distance[cell]
         if not everything and wanted == 0 and d > last:
@@ -118,6 +119,7 @@ def _search(
         head += 1
         bits = cells[cell]
         mask = moves[cell]
+        left -= ((bits & FRONTIER) > 0) + ((bits & KNOWN_TARGET) > 0)
         if bits & FRONTIER and (nearest[0, 0] < 0 or nearest[0, 0] == d):
             wanted -= nearest[0, 0] < 0
             nearest[0, 0] = d

@@ -1,0 +1,308 @@
+"""``TeamRolloutBuffer``: rollouts whose minibatches keep teams together."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictRolloutBuffer
+from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
+
+from sb3_roles.common.losses import lambda_returns
+from sb3_roles.common.policies import Streams
+from sb3_roles.common.team_wrapper import AGENT_KEY
+
+
+class TeamSamples(NamedTuple):
+    """A minibatch of whole teams; n rows, S streams, K_s choices in a stream."""
+
+    observations: dict[str, th.Tensor]
+    actions: th.Tensor
+    """int64 (n, S)"""
+    old_log_probs: tuple[th.Tensor, ...]
+    """per stream float (n, K_s)"""
+    advantages: th.Tensor
+    """float (n, S)"""
+    returns: th.Tensor
+    """float (n, S)"""
+    active: th.Tensor
+    """bool (n, S)"""
+
+
+class _MapStore:
+    """The values of one key over time; maps are laid out with their channels last in memory."""
+
+    def __init__(self, buffer_size: int, sample: th.Tensor) -> None:
+        self.is_map = sample.ndim == 4
+        inner = sample.permute(0, 2, 3, 1) if self.is_map else sample
+        self.memory = th.zeros(
+            (buffer_size, *inner.shape), dtype=sample.dtype, device=sample.device
+        )
+
+    def put(self, t: int, value: th.Tensor) -> None:
+        self.memory[t].copy_(value.permute(0, 2, 3, 1) if self.is_map else value)
+
+    def take(self, index: th.Tensor, per_team: int) -> th.Tensor:
+        """Gather (time, team) pairs.
+
+        :param index: int64 (b,), time * n_teams + team
+        :param per_team: rows of this key per team
+        :return: (b * per_team, ...)
+        """
+        groups = self.memory.view(-1, per_team, *self.memory.shape[2:])
+        taken = groups[index].flatten(0, 1)
+        return taken.permute(0, 3, 1, 2) if self.is_map else taken
+
+
+class TeamRolloutBuffer(DictRolloutBuffer):
+    """On-policy rollouts of teams, as tensors on the training device.
+
+    Minibatches are permutations of (time, team) pairs: the rows of a team stay together and in
+    order, which the graph and the team-level maps need. What a team shares is stored once per team
+    when it is given once per team. Stock PPO, A2C, TRPO and MaskablePPO take it as
+    ``rollout_buffer_class``; MAPPO and HMAPPO use its streams.
+
+    :param buffer_size: steps per rollout
+    :param observation_space: of one row, with the key ``agent``
+    :param action_space: of one row
+    :param device: where the tensors are
+    :param gae_lambda: for stock algorithms
+    :param gamma: for stock algorithms
+    :param n_envs: rows
+    """
+
+    observation_space: spaces.Dict
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        gae_lambda: float = 1.0,
+        gamma: float = 0.99,
+        n_envs: int = 1,
+    ) -> None:
+        if AGENT_KEY not in observation_space.spaces:
+            raise ValueError(
+                f"TeamRolloutBuffer needs the observation key {AGENT_KEY!r}: wrap the environment "
+                "in TeamWrapper or RoleWrapper"
+            )
+        self._stores: dict[str, _MapStore] = {}
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device,
+            gae_lambda=gae_lambda,
+            gamma=gamma,
+            n_envs=n_envs,
+        )
+
+    def reset(self) -> None:
+        """Forget the rollout; memory is kept, and allocated at the first use."""
+        self.pos = 0
+        self.full = False
+        self.generator_ready = False
+
+    def _allocate(self, observations: Mapping[str, th.Tensor], chosen: Streams) -> None:
+        self.n_agents = int(observations[AGENT_KEY][0, 1])
+        self.n_teams = self.n_envs // self.n_agents
+        for key, value in observations.items():
+            self._stores[key] = _MapStore(self.buffer_size, value)
+        n_streams = chosen.actions.shape[1]
+
+        def rows(*shape: int, dtype: th.dtype = th.float32) -> th.Tensor:
+            size = (self.buffer_size, self.n_envs, *shape)
+            return th.zeros(size, dtype=dtype, device=self.device)
+
+        self._actions = rows(n_streams, dtype=th.int64)
+        self._active = rows(n_streams, dtype=th.bool)
+        self._rewards = rows(n_streams)
+        self._values = rows(n_streams)
+        self._expected_values = rows(n_streams)
+        self._returns = rows(n_streams)
+        self._advantages = rows(n_streams)
+        self._ends = rows(dtype=th.bool)
+        self._log_probs = [rows(log_probs.shape[1]) for log_probs in chosen.log_probs]
+        # Of stock algorithms, which know only the action's log-probability.
+        self._joint_log_prob = rows()
+
+    def add_streams(
+        self,
+        observations: Mapping[str, th.Tensor],
+        chosen: Streams,
+        rewards: th.Tensor,
+        ends: th.Tensor,
+    ) -> None:
+        """Add one step of all teams.
+
+        :param observations: what the policy saw
+        :param chosen: what it said
+        :param rewards: float (n, S); with the value at a truncation already added
+        :param ends: bool (n,), whether the episode ended with this step
+        """
+        if not self._stores:
+            self._allocate(observations, chosen)
+        t = self.pos
+        for key, store in self._stores.items():
+            store.put(t, observations[key])
+        self._actions[t] = chosen.actions
+        self._active[t] = chosen.active
+        self._rewards[t] = rewards
+        self._values[t] = chosen.values
+        self._expected_values[t] = chosen.expected_values
+        self._ends[t] = ends
+        for memory, log_probs in zip(self._log_probs, chosen.log_probs, strict=True):
+            memory[t] = log_probs
+        self.pos += 1
+        self.full = self.pos == self.buffer_size
+
+    def compute_stream_returns(
+        self,
+        last_expected_values: th.Tensor,
+        gamma: th.Tensor,
+        gae_lambda: th.Tensor,
+        normalize_advantage: bool,
+    ) -> None:
+        """Compute returns and advantages of every stream.
+
+        :param last_expected_values: float (n, S), after the last step
+        :param gamma: float (S,)
+        :param gae_lambda: float (S,)
+        :param normalize_advantage: to mean 0 and deviation 1 over the rows in which a stream
+            decided, per stream
+        """
+        self._returns = lambda_returns(
+            self._rewards,
+            self._expected_values,
+            last_expected_values,
+            self._ends,
+            gamma,
+            gae_lambda,
+        )
+        self._advantages = self._returns - self._values
+        if normalize_advantage:
+            for s in range(self._advantages.shape[2]):
+                used = self._advantages[..., s][self._active[..., s]]
+                if len(used) > 1:
+                    scaled = (self._advantages[..., s] - used.mean()) / (used.std() + 1e-8)
+                    self._advantages[..., s] = scaled
+
+    def _index(self, batch_teams: int | None) -> Generator[th.Tensor, None, None]:
+        n = self.buffer_size * self.n_teams
+        # Drawn on the CPU: the same permutations on every device.
+        permutation = th.randperm(n).to(self.device)
+        for start in range(0, n, batch_teams or n):
+            yield permutation[start : start + (batch_teams or n)]
+
+    def _take(self, memory: th.Tensor, index: th.Tensor) -> th.Tensor:
+        groups = memory.view(-1, self.n_agents, *memory.shape[2:])
+        return groups[index].flatten(0, 1)
+
+    def _observations_at(self, index: th.Tensor) -> dict[str, th.Tensor]:
+        return {
+            key: store.take(index, store.memory.shape[1] // self.n_teams)
+            for key, store in self._stores.items()
+        }
+
+    def minibatches(self, batch_teams: int) -> Generator[TeamSamples, None, None]:
+        """Go once through the rollout, in a random order of (time, team) pairs.
+
+        :param batch_teams: pairs, that is, joint steps, per minibatch
+        """
+        for index in self._index(batch_teams):
+            yield TeamSamples(
+                self._observations_at(index),
+                self._take(self._actions, index),
+                tuple(self._take(memory, index) for memory in self._log_probs),
+                self._take(self._advantages, index),
+                self._take(self._returns, index),
+                self._take(self._active, index),
+            )
+
+    # The interface of Stable-Baselines3's buffers
+
+    def add(  # type: ignore[override]
+        self,
+        obs: Mapping[str, np.ndarray],
+        action: np.ndarray,
+        reward: np.ndarray,
+        episode_start: np.ndarray,
+        value: th.Tensor,
+        log_prob: th.Tensor,
+    ) -> None:
+        """Add one step; see ``RolloutBuffer.add``. Rows of all teams, in order."""
+        tensors = {
+            key: th.as_tensor(np.asarray(array)).to(self.device) for key, array in obs.items()
+        }
+        flat = th.as_tensor(action, device=self.device).view(self.n_envs, -1).long()
+        column = value.detach().view(-1, 1)
+        chosen = Streams(flat, (), column, column, th.ones_like(flat, dtype=th.bool))
+        if not self._stores:
+            self._allocate(tensors, chosen)
+            self._rewards, self._values = self._rewards[..., :1], self._values[..., :1]
+            self._expected_values = self._expected_values[..., :1]
+        if self.pos:
+            self._ends[self.pos - 1] = th.as_tensor(episode_start, device=self.device) > 0
+        t = self.pos
+        self._joint_log_prob[t] = log_prob.detach()
+        ends = th.zeros(self.n_envs, dtype=th.bool, device=self.device)
+        rewards = th.as_tensor(reward, device=self.device, dtype=th.float32).view(-1, 1)
+        self.add_streams(tensors, chosen, rewards, ends)
+
+    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
+        """Compute returns and advantages; see ``RolloutBuffer``."""
+        self._ends[self.pos - 1] = th.as_tensor(dones, device=self.device)
+        gamma, gae_lambda = (
+            th.tensor([x], dtype=th.float32, device=self.device)
+            for x in (self.gamma, self.gae_lambda)
+        )
+        last = last_values.detach().view(-1, 1)
+        self.compute_stream_returns(last, gamma, gae_lambda, normalize_advantage=False)
+
+    def get(  # type: ignore[override]
+        self, batch_size: int | None = None
+    ) -> Generator[DictRolloutBufferSamples, None, None]:
+        """Go once through the rollout.
+
+        :param batch_size: rows per minibatch, rounded down to whole teams; None for all
+        """
+        assert self.full, "the rollout is not complete"
+        teams = None if batch_size is None else max(1, batch_size // self.n_agents)
+        for index in self._index(teams):
+            yield DictRolloutBufferSamples(
+                observations=self._observations_at(index),  # type: ignore[arg-type]
+                actions=self._take(self._actions, index),
+                old_values=self._take(self._values, index).flatten(),
+                old_log_prob=self._take(self._joint_log_prob, index),
+                advantages=self._take(self._advantages, index).flatten(),
+                returns=self._take(self._returns, index).flatten(),
+            )
+
+    def _first_stream(self, memory: th.Tensor) -> np.ndarray:
+        return memory[..., 0].cpu().numpy()
+
+    def stream_arrays(self, stream: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return values and returns of one stream, float32 (T, n) each."""
+        arrays = (self._values[..., stream], self._returns[..., stream])
+        return arrays[0].cpu().numpy(), arrays[1].cpu().numpy()
+
+    # DictRolloutBuffer has these as attributes, which stock algorithms read.
+    @property
+    def values(self) -> Any:
+        """Values of the first stream, float32 (T, n)."""
+        return self._first_stream(self._values)
+
+    @property
+    def returns(self) -> Any:
+        """Returns of the first stream, float32 (T, n)."""
+        return self._first_stream(self._returns)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory that hold observations."""
+        return sum(store.memory.nbytes for store in self._stores.values())

@@ -1,0 +1,272 @@
+"""Network parts: map encoders, the graph layer, role-conditioned heads. None depends on team size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_roles.common.names import closest
+
+NORM_LAYERS = ("none", "frozen_batch", "group")
+PRECISIONS = ("auto", "fp32", "bf16")
+
+# (kernel, stride, padding) of each convolution, pooling behind the first one, and the grid that is
+# left of any map: the released code's networks, which reduce 9 x 9 and 25 x 25 maps to 1 x 1.
+_STYLES: dict[str, tuple[tuple[tuple[int, int, int], ...], bool, int]] = {
+    "local": (((4, 2, 2), (4, 2, 2), (3, 2, 0)), False, 1),
+    "joint": (((5, 2, 2), (3, 2, 1), (3, 2, 1), (3, 2, 1)), True, 1),
+    "state": (((4, 2, 1), (4, 2, 1), (4, 2, 1)), False, 2),
+}
+CHANNELS = {"local": (8, 16, 32), "joint": (16, 32, 64, 64), "state": (8, 16, 32)}
+_MIN_SIDE = {"local": 3, "joint": 5, "state": 8}
+
+
+class FrozenBatchNorm2d(nn.BatchNorm2d):
+    """Batch normalization whose statistics change only inside :func:`updating_statistics`.
+
+    Collecting with one normalization and training with another would make the probability ratio
+    differ from 1 before any step; here both passes use the statistics of before the rollout.
+    """
+
+    def train(self, mode: bool = True) -> FrozenBatchNorm2d:
+        """Stay in evaluation mode, whatever the policy does."""
+        return super().train(False)
+
+
+@contextmanager
+def updating_statistics(module: nn.Module) -> Iterator[bool]:
+    """Let forward passes update the statistics of all frozen normalization layers.
+
+    :param module: the networks
+    :return: whether there is any such layer
+    """
+    layers = [layer for layer in module.modules() if isinstance(layer, FrozenBatchNorm2d)]
+    for layer in layers:
+        nn.BatchNorm2d.train(layer, True)
+    try:
+        yield bool(layers)
+    finally:
+        for layer in layers:
+            nn.BatchNorm2d.train(layer, False)
+
+
+def make_norm(norm_layer: str, channels: int) -> nn.Module:
+    """Return the normalization behind a convolution.
+
+    :param norm_layer: ``"none"``, ``"frozen_batch"`` or ``"group"``
+    :param channels: channels of the convolution
+    :raises ValueError: if the name is unknown
+    """
+    if norm_layer == "none":
+        return nn.Identity()
+    if norm_layer == "frozen_batch":
+        return FrozenBatchNorm2d(channels)
+    if norm_layer == "group":
+        return nn.GroupNorm(max(1, channels // 8), channels)
+    raise ValueError(closest("norm_layer", norm_layer, NORM_LAYERS))
+
+
+class MapEncoder(nn.Module):
+    """Convolutions over a map of any size, to a vector.
+
+    :param in_channels: channels of the map
+    :param style: ``"local"``, ``"joint"`` or ``"state"``: the released code's three encoders
+    :param channels: output channels of each convolution
+    :param norm_layer: see :func:`make_norm`; only the joint encoder has it, as in the paper
+    :raises ValueError: if the number of channels does not fit the style
+    """
+
+    def __init__(
+        self, in_channels: int, style: str, channels: Sequence[int], norm_layer: str = "none"
+    ) -> None:
+        super().__init__()
+        convolutions, pool, self.grid = _STYLES[style]
+        if len(channels) != len(convolutions):
+            raise ValueError(
+                f"the {style} encoder has {len(convolutions)} convolutions, "
+                f"got channels {list(channels)}"
+            )
+        self.min_side = _MIN_SIDE[style]
+        layers: list[nn.Module] = []
+        width = in_channels
+        for k, ((kernel, stride, padding), out) in enumerate(
+            zip(convolutions, channels, strict=True)
+        ):
+            layers.append(nn.Conv2d(width, out, kernel, stride, padding))
+            if style == "joint":
+                layers.append(make_norm(norm_layer, out))
+            layers.append(nn.ReLU(inplace=True))
+            if pool and k == 0:
+                layers.append(nn.MaxPool2d(2))
+            width = out
+        self.layers = nn.Sequential(*layers)
+        self.out_features = width * self.grid * self.grid
+
+    def forward(self, maps: th.Tensor) -> th.Tensor:
+        """Encode maps.
+
+        :param maps: float (n, in_channels, height, width)
+        :return: float (n, out_features)
+        """
+        short = [max(0, self.min_side - side) for side in maps.shape[-2:]]
+        if any(short):
+            maps = F.pad(maps, (0, short[1], 0, short[0]))
+        encoded = self.layers(maps)
+        if encoded.shape[-2:] != (self.grid, self.grid):
+            encoded = F.adaptive_avg_pool2d(encoded, self.grid)
+        return encoded.flatten(1)
+
+
+def symlog(x: th.Tensor) -> th.Tensor:
+    """Compress a quantity without bounds: sign(x) log(1 + abs(x))."""
+    return x.sign() * x.abs().log1p()
+
+
+def mlp(in_features: int, widths: Sequence[int]) -> nn.Sequential:
+    """Linear layers, each with a ReLU behind it.
+
+    :param in_features: size of the input
+    :param widths: size of each layer
+    """
+    layers: list[nn.Module] = []
+    for width in widths:
+        layers += [nn.Linear(in_features, width), nn.ReLU(inplace=True)]
+        in_features = width
+    return nn.Sequential(*layers)
+
+
+class Head(nn.Module):
+    """An MLP with a linear output.
+
+    :param in_features: size of the input
+    :param widths: sizes of the hidden layers
+    :param out_features: size of the output
+    :param gain: scale of the output layer's orthogonal initialization
+    """
+
+    def __init__(
+        self, in_features: int, widths: Sequence[int], out_features: int, gain: float
+    ) -> None:
+        super().__init__()
+        self.hidden = mlp(in_features, widths)
+        self.out = nn.Linear(widths[-1] if widths else in_features, out_features)
+        self.gain = gain
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """Map (n, in_features) to (n, out_features)."""
+        return self.out(self.hidden(x))
+
+
+class RoleHead(nn.Module):
+    """A head on the concatenation of features and a one-hot role (Section V-B).
+
+    The first layer is computed as features' part + role's part, which is the same as on the
+    concatenation, and lets one pass serve all roles.
+
+    :param in_features: size of the features
+    :param n_roles: number of roles
+    :param widths: sizes of the hidden layers, at least one
+    :param out_features: size of the output
+    :param gain: scale of the output layer's orthogonal initialization
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        n_roles: int,
+        widths: Sequence[int],
+        out_features: int,
+        gain: float,
+    ) -> None:
+        super().__init__()
+        if not widths:
+            raise ValueError("a role-conditioned head needs at least one hidden layer")
+        self.features = nn.Linear(in_features, widths[0])
+        self.role = nn.Linear(n_roles, widths[0], bias=False)
+        self.head = Head(widths[0], widths[1:], out_features, gain)
+
+    def forward(self, x: th.Tensor, roles: th.Tensor | None = None) -> th.Tensor:
+        """Evaluate for one role per row, or for all of them.
+
+        :param x: float (n, in_features)
+        :param roles: int64 (n,); None for all roles
+        :return: float (n, out_features), or (n, n_roles, out_features)
+        """
+        first = self.features(x)
+        by_role = self.role.weight.t().to(first.dtype)
+        if roles is None:
+            return self.head(F.relu(first.unsqueeze(1) + by_role))
+        return self.head(F.relu(first + by_role[roles]))
+
+
+class GraphLayer(nn.Module):
+    """One round of messages between team mates: ReLU(W0 x_i + W1 sum_j S_ij x_j).
+
+    :param in_features: size of a robot's features
+    :param out_features: size of the output
+    """
+
+    def __init__(self, in_features: int, out_features: int) -> None:
+        super().__init__()
+        self.own = nn.Linear(in_features, out_features)
+        self.others = nn.Linear(in_features, out_features, bias=False)
+
+    def forward(self, x: th.Tensor, graph: th.Tensor) -> th.Tensor:
+        """Pass messages.
+
+        :param x: float (n_teams, n_agents, in_features)
+        :param graph: float (n_teams, n_agents, n_agents), S
+        :return: float (n_teams, n_agents, out_features)
+        """
+        messages = th.bmm(graph.to(x.dtype), x)
+        return F.relu(self.own(x) + self.others(messages))
+
+
+def communication_graph(
+    position: th.Tensor | None, radius: float | None, like: th.Tensor
+) -> th.Tensor:
+    """Return S = D^-1/2 A D^-1/2, where A links robots strictly nearer than a radius.
+
+    :param position: float (n_teams, n_agents, 2); None links all robots of a team
+    :param radius: communication radius in the unit of ``position``; None links all
+    :param like: float (n_teams, n_agents, any): gives shape and device
+    :return: float32 (n_teams, n_agents, n_agents), zero on the diagonal
+    """
+    n_agents = like.shape[1]
+    apart = ~th.eye(n_agents, dtype=th.bool, device=like.device)
+    if position is None or radius is None:
+        linked = apart.expand(like.shape[0], n_agents, n_agents).float()
+    else:
+        # Coordinates are small whole numbers for a grid: this distance is exact.
+        offset = position.unsqueeze(2) - position.unsqueeze(1)
+        near = offset.square().sum(-1) < radius * radius
+        linked = (near & apart).float()
+    scale = linked.sum(-1).clamp(min=1.0).rsqrt()
+    return scale.unsqueeze(2) * linked * scale.unsqueeze(1)
+
+
+def has_fast_bfloat16() -> bool:
+    """Whether this CPU multiplies bfloat16 matrices in hardware."""
+    with_amx = getattr(th.cpu, "_is_amx_tile_supported", lambda: False)()
+    with_avx = getattr(th.cpu, "_is_avx512_bf16_supported", lambda: False)()
+    return bool(with_amx or with_avx)
+
+
+def resolve_precision(precision: str, device: th.device | str) -> str:
+    """Turn ``"auto"`` into what pays on a device.
+
+    :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``
+    :param device: where the networks are
+    :return: ``"fp32"`` or ``"bf16"``
+    :raises ValueError: if the name is unknown
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(closest("precision", precision, PRECISIONS))
+    if precision != "auto":
+        return precision
+    on_cpu = th.device(device).type == "cpu"
+    return "bf16" if (has_fast_bfloat16() if on_cpu else th.cuda.is_bf16_supported()) else "fp32"

@@ -1,0 +1,1 @@
+"""Evaluation: play episodes into records, and turn records into metrics."""

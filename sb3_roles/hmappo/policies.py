@@ -1,0 +1,212 @@
+"""The policy of HMAPPO: a role actor, a primitive actor, and a central critic for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import Schedule
+from torch.nn import functional as F
+
+from sb3_roles.common.distributions import (
+    RoleDistribution,
+    pick,
+    role_log_probabilities,
+    sample_index,
+)
+from sb3_roles.common.names import closest
+from sb3_roles.common.policies import Observation, Streams, TeamPolicy
+from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, STREAMS
+from sb3_roles.common.torch_layers import GraphLayer, Head, RoleHead, mlp
+
+PRIMITIVE_INPUTS = ("own", "graph")
+
+
+class RoleActorCriticPolicy(TeamPolicy):
+    """p(role, move) = p(role) p(move | role), and a value for each level (Sections V-A, V-B).
+
+    The role actor encodes its keys, mixes them by an MLP, exchanges the result with the robots that
+    can communicate, and chooses a role. The primitive actor reads its own keys and the role, and
+    chooses the move. The role critic and the role-conditioned primitive critic read the critic
+    keys. Where a role goes on (``role_due`` of ``RoleWrapper``), its probability is 1.
+
+    Plain PPO, A2C and TRPO can train it on the role reward (``TeamRolloutBuffer`` needed).
+
+    :param role_arch: layers of the role actor before the graph
+    :param role_head_arch: hidden layers of the role actor behind the graph
+    :param primitive_keys: what the primitive actor reads; by default what the role actor reads
+    :param primitive_input: ``"own"``: those keys only (the paper); ``"graph"``: the role actor's
+        features behind the graph, too
+    :param primitive_arch: hidden layers of the primitive actor
+    :param value_arch: hidden layers of both critics
+    :param see_role: give the role that is going on to the role actor and the critics; for roles
+        that last several steps
+    :param options: see :class:`~sb3_roles.common.policies.TeamPolicy`
+    :raises ValueError: if the action space is not (role, move), or an option is unknown
+    """
+
+    stream_names: ClassVar[tuple[str, ...]] = STREAMS
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        *,
+        role_arch: Sequence[int] = (128, 64, 32),
+        role_head_arch: Sequence[int] = (64, 32),
+        primitive_keys: Sequence[str] | None = None,
+        primitive_input: str = "own",
+        primitive_arch: Sequence[int] = (64, 32),
+        value_arch: Sequence[int] = (64, 32),
+        see_role: bool = False,
+        **options: Any,
+    ) -> None:
+        pair = isinstance(action_space, spaces.MultiDiscrete) and action_space.shape == (2,)
+        if (
+            not pair
+            or not isinstance(observation_space, spaces.Dict)
+            or (ROLE_KEY not in observation_space.spaces)
+        ):
+            raise ValueError(
+                f"RoleActorCriticPolicy acts with (role, move), got {action_space}: wrap the "
+                "environment in RoleWrapper"
+            )
+        if primitive_input not in PRIMITIVE_INPUTS:
+            raise ValueError(closest("primitive_input", primitive_input, PRIMITIVE_INPUTS))
+        self.role_arch = tuple(role_arch)
+        self.role_head_arch = tuple(role_head_arch)
+        self.primitive_keys = None if primitive_keys is None else tuple(primitive_keys)
+        self.primitive_input = primitive_input
+        self.primitive_arch = tuple(primitive_arch)
+        self.value_arch = tuple(value_arch)
+        self.see_role = see_role
+        self.n_roles, self.n_moves = (int(n) for n in action_space.nvec)  # type: ignore[attr-defined]
+        super().__init__(observation_space, action_space, lr_schedule, **options)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        names = (
+            "role_arch",
+            "role_head_arch",
+            "primitive_keys",
+            "primitive_input",
+            "primitive_arch",
+            "value_arch",
+            "see_role",
+        )
+        return {
+            **super()._get_constructor_parameters(),
+            **{name: getattr(self, name) for name in names},
+        }
+
+    def _build_networks(self) -> None:
+        keys = self.primitive_keys or self.actor_keys
+        for key in keys:
+            if key not in self.actor_keys:
+                raise ValueError(closest("key in primitive_keys", key, self.actor_keys))
+        self._move_keys = keys
+        seen = self.n_roles if self.see_role else 0
+
+        size = self._add_encoders("role", self.actor_keys) + seen
+        self.role_mlp = mlp(size, self.role_arch)
+        size = self.role_arch[-1] if self.role_arch else size
+        if self.graph:
+            self.role_graph = GraphLayer(size, self.graph_width)
+            size = self.graph_width
+        self.role_net = Head(size, self.role_head_arch, self.n_roles, gain=0.01)
+
+        own = self._add_encoders("primitive", keys)
+        own += size if self.primitive_input == "graph" else 0
+        self.action_net = RoleHead(own, self.n_roles, self.primitive_arch, self.n_moves, gain=0.01)
+
+        size = self._add_encoders("value_role", self.critic_keys) + seen
+        self.role_value_net = Head(size, self.value_arch, 1, gain=1.0)
+        size = self._add_encoders("value_primitive", self.critic_keys)
+        self.value_net = RoleHead(  # type: ignore[assignment]
+            size, self.n_roles, self.value_arch, 1, gain=1.0
+        )
+        self.action_dist = RoleDistribution()
+
+    def _with_role(self, features: th.Tensor, obs: Observation) -> th.Tensor:
+        return th.cat([features, obs[ROLE_KEY]], dim=1) if self.see_role else features
+
+    def _actor_features(
+        self, obs: Observation, memo: dict[str, th.Tensor]
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Return the roles' log-probabilities (n, n_roles) and the primitive actor's input."""
+        n_agents = self.team_size(obs)
+        features = self._with_role(self._encode("role", self.actor_keys, obs, memo), obs)
+        features = self.role_mlp(features)
+        if self.graph:
+            graph = self._graph(obs, features, n_agents)
+            teams = features.view(-1, n_agents, features.shape[1])
+            features = self.role_graph(teams, graph).flatten(0, 1)
+        logits = self.role_net(features).float()
+        role_log_probs = role_log_probabilities(
+            logits, obs[ROLE_KEY], obs[ROLE_DUE_KEY][:, 0] > 0.5
+        )
+        own = self._encode("primitive", self._move_keys, obs, memo)
+        if self.primitive_input == "graph":
+            own = th.cat([own, features], dim=1)
+        return role_log_probs, own
+
+    def _role_values(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:
+        features = self._encode("value_role", self.critic_keys, obs, memo)
+        return self.role_value_net(self._with_role(features, obs)).float()
+
+    def streams(
+        self,
+        obs: Observation,
+        actions: th.Tensor | None = None,
+        deterministic: bool = False,
+    ) -> Streams:
+        """Evaluate both actors and both critics, see :meth:`TeamPolicy.streams`.
+
+        The primitive value to bootstrap with is the expectation over roles: the role of the next
+        step is not chosen yet.
+        """
+        memo: dict[str, th.Tensor] = {}
+        choose = actions is None
+        with self._autocast():
+            role_log_probs, own = self._actor_features(obs, memo)
+            if actions is None:
+                roles = role_log_probs.argmax(1) if deterministic else sample_index(role_log_probs)
+            else:
+                roles = actions[:, 0]
+            move_log_probs = F.log_softmax(self.action_net(own, roles).float(), dim=1)
+            role_values = self._role_values(obs, memo)
+            critic = self._encode("value_primitive", self.critic_keys, obs, memo)
+            move_values = self.value_net(critic, None if choose else roles).float()
+        if actions is None:
+            moves = move_log_probs.argmax(1) if deterministic else sample_index(move_log_probs)
+            actions = th.stack([roles, moves], dim=1)
+        expected = move_values
+        if choose:
+            by_role = move_values.squeeze(2)
+            expected = (role_log_probs.exp() * by_role).sum(1, keepdim=True)
+            move_values = pick(by_role, roles).unsqueeze(1)
+        active = th.ones_like(actions, dtype=th.bool)
+        active[:, 0] = obs[ROLE_DUE_KEY][:, 0] > 0.5
+        return Streams(
+            actions,
+            (role_log_probs, move_log_probs),
+            th.cat([role_values, move_values], dim=1),
+            th.cat([role_values, expected], dim=1),
+            active,
+        )
+
+    def get_distribution(  # type: ignore[override]
+        self, obs: th.Tensor | Observation
+    ) -> RoleDistribution:
+        """Return the joint distribution over role and move of whole teams."""
+        with self._autocast():
+            role_log_probs, own = self._actor_features(obs, {})  # type: ignore[arg-type]
+            move_log_probs = F.log_softmax(self.action_net(own).float(), dim=2)
+        return RoleDistribution().proba_distribution(role_log_probs, move_log_probs)
+
+    def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:  # type: ignore[override]
+        """Return the role values of any rows, float (n, 1)."""
+        with self._autocast():
+            return self._role_values(obs, {})  # type: ignore[arg-type]

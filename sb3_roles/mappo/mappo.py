@@ -1,0 +1,377 @@
+"""MAPPO: PPO for teams, with central critics and an exact, adaptive KL penalty."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_roles.common.buffers import TeamRolloutBuffer
+from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
+from sb3_roles.common.policies import TeamPolicy
+from sb3_roles.common.team_wrapper import AGENT_KEY, TeamWrapper, find_team_env
+from sb3_roles.common.torch_layers import updating_statistics
+from sb3_roles.mappo.policies import TeamActorCriticPolicy
+
+SelfMAPPO = TypeVar("SelfMAPPO", bound="MAPPO")
+
+
+class StreamSettings(NamedTuple):
+    """The coefficients of one stream, at one point of training."""
+
+    gamma: float
+    gae_lambda: float
+    clip_range: float
+    ent_coef: float
+    vf_coef: float
+
+
+class MAPPO(OnPolicyAlgorithm):
+    """Multi-agent PPO with shared parameters, decentralized actors and central critics (CTDE).
+
+    The loss is L = L_CLIP + c1 L_KL + c2 L_VF + c3 L_E (Eq. 8); L_KL is the exact divergence from
+    the policy that acted, and its coefficient adapts as RLlib's does. Schedules are functions of
+    the progress that remains, from 1 to 0.
+
+    :param policy: ``"TeamPolicy"``, or a subclass of ``TeamPolicy``
+    :param env: an environment of ``make_team_vec_env``, possibly wrapped
+    :param learning_rate: of Adam; a number or a schedule
+    :param n_steps: joint steps per team and rollout
+    :param batch_size: joint steps (of one team each) per minibatch
+    :param n_epochs: passes over a rollout
+    :param gamma: discount
+    :param gae_lambda: lambda of the TD(lambda) returns
+    :param clip_range: epsilon of the clipped surrogate; a number or a schedule
+    :param normalize_advantage: over each rollout
+    :param ent_coef: coefficient of the entropy bonus; a number or a schedule
+    :param vf_coef: coefficient of the squared value error
+    :param kl_coef: first coefficient of the KL penalty; 0 switches it off
+    :param kl_target: the divergence per update, in nats, that the coefficient adapts to
+    :param max_grad_norm: gradients are clipped to this norm; None does not clip
+    :param target_kl: stop the epochs of an update when a minibatch diverges by more than 1.5 times
+        this; None never
+    :param policy_kwargs: arguments of the policy
+    :param stats_window_size: episodes over which ``rollout/`` averages
+    :param tensorboard_log: folder for TensorBoard
+    :param verbose: 0, 1 or 2
+    :param seed: of the policy, the minibatches and the environment
+    :param device: where to train
+    :raises ValueError: if a parameter is out of range, or the environment has no teams
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TeamPolicy": TeamActorCriticPolicy}
+    policy: TeamPolicy
+    rollout_buffer: TeamRolloutBuffer
+    wrapper_class: ClassVar[type[TeamWrapper]] = TeamWrapper
+
+    def __init__(
+        self,
+        policy: str | type[TeamPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 5e-4,
+        n_steps: int = 50,
+        batch_size: int = 1000,
+        n_epochs: int = 5,
+        gamma: float = 0.95,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        normalize_advantage: bool = True,
+        ent_coef: float | Schedule = 0.01,
+        vf_coef: float = 0.5,
+        kl_coef: float = 0.0,
+        kl_target: float = 0.01,
+        max_grad_norm: float | None = 0.5,
+        target_kl: float | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,  # type: ignore[arg-type]
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            use_sde=False,
+            sde_sample_freq=-1,
+            rollout_buffer_class=TeamRolloutBuffer,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            monitor_wrapper=False,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+            supported_action_spaces=(spaces.Discrete, spaces.MultiDiscrete),
+        )
+        self.batch_size = batch_size
+        self.n_epochs = n_epochs
+        self.clip_range = clip_range
+        self.normalize_advantage = normalize_advantage
+        self.kl_coef = kl_coef
+        self.kl_target = kl_target
+        self.target_kl = target_kl
+        self.kl_coefs: list[float] = []
+        _check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs)
+        _check_unit(gamma=gamma, gae_lambda=gae_lambda)
+        _check_not_negative(vf_coef=vf_coef, kl_coef=kl_coef, kl_target=kl_target)
+        for name, value in (("max_grad_norm", max_grad_norm), ("target_kl", target_kl)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be a number above 0 or None, got {value!r}")
+        for name, schedule in (
+            ("learning_rate", learning_rate),
+            ("clip_range", clip_range),
+            ("ent_coef", ent_coef),
+        ):
+            if not callable(schedule):
+                _check_not_negative(**{name: schedule})
+        if _init_setup_model:
+            self._setup_model()
+
+    @classmethod
+    def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # Also called by load() and set_env(), with whatever environment the user has.
+        if not isinstance(env, VecEnv):
+            raise ValueError(
+                f"{cls.__name__} trains teams: make the environment with make_team_vec_env, "
+                f"got {type(env).__name__}"
+            )
+        find_team_env(env)
+        space = env.observation_space
+        wrapped = isinstance(space, spaces.Dict) and AGENT_KEY in space.spaces
+        return env if wrapped else cls.wrapper_class(env)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.clip_schedule = FloatSchedule(self.clip_range)
+        self.ent_schedule = FloatSchedule(self.ent_coef)
+        if not self.kl_coefs:
+            self.kl_coefs = self._initial_kl_coefs()
+
+    def _initial_kl_coefs(self) -> list[float]:
+        return [self.kl_coef]
+
+    def _settings(self) -> list[StreamSettings]:
+        """Coefficients of each stream now, in the order of ``policy.stream_names``."""
+        progress = self._current_progress_remaining
+        return [
+            StreamSettings(
+                self.gamma,
+                self.gae_lambda,
+                self.clip_schedule(progress),
+                self.ent_schedule(progress),
+                self.vf_coef,
+            )
+        ]
+
+    def _stream_rewards(self, env: VecEnv, rewards: np.ndarray) -> np.ndarray:
+        """Rewards of each stream in the last step, float32 (n, S)."""
+        return rewards[:, None]
+
+    def _to_env(self, actions: np.ndarray) -> np.ndarray:
+        return actions[:, 0]
+
+    def collect_rollouts(  # type: ignore[override]
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Play ``n_rollout_steps`` joint steps in every team.
+
+        :return: False if a callback asked to stop
+        """
+        assert isinstance(rollout_buffer, TeamRolloutBuffer)
+        assert self._last_obs is not None, "no previous observation was provided"
+        self.policy.set_training_mode(False)
+        with updating_statistics(self.policy) as has_statistics, th.no_grad():
+            if has_statistics:
+                self.policy.streams(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
+        rollout_buffer.reset()
+        callback.on_rollout_start()
+        for _ in range(n_rollout_steps):
+            obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
+            with th.inference_mode():
+                chosen = self.policy.streams(obs)  # type: ignore[arg-type]
+            actions = chosen.actions.cpu().numpy()
+            new_obs, rewards, dones, infos = env.step(self._to_env(actions))
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            self._update_info_buffer(infos, dones)
+            stream_rewards = th.as_tensor(self._stream_rewards(env, rewards)).to(self.device)
+            self._bootstrap(stream_rewards, dones, infos)
+            ends = th.as_tensor(dones).to(self.device)
+            rollout_buffer.add_streams(obs, chosen, stream_rewards, ends)  # type: ignore[arg-type]
+            self._last_obs = new_obs  # type: ignore[assignment]
+            self._last_episode_starts = dones
+        with th.inference_mode():
+            last = self.policy.streams(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
+        settings = self._settings()
+        rollout_buffer.compute_stream_returns(
+            last.expected_values,
+            th.tensor([s.gamma for s in settings], device=self.device),
+            th.tensor([s.gae_lambda for s in settings], device=self.device),
+            self.normalize_advantage,
+        )
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _bootstrap(
+        self, stream_rewards: th.Tensor, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        """Add the value of the last observation to the last reward of truncated episodes."""
+        rows = [row for row in np.flatnonzero(dones) if infos[row].get("TimeLimit.truncated")]
+        if not rows:
+            return
+        last = [infos[row]["terminal_observation"] for row in rows]
+        stacked = {key: np.stack([one[key] for one in last]) for key in last[0]}
+        with th.inference_mode():
+            values = self.policy.streams(obs_as_tensor(stacked, self.device)).expected_values  # type: ignore[arg-type]
+        gamma = th.tensor([s.gamma for s in self._settings()], device=self.device)
+        stream_rewards[rows] += gamma * values
+
+    def train(self) -> None:
+        """Update the policy on the rollout."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        settings = self._settings()
+        history: list[list[StreamLoss]] = [[] for _ in settings]
+        n_steps = 0
+        stopped = False
+        for _ in range(self.n_epochs):
+            for batch in self.rollout_buffer.minibatches(self.batch_size):
+                now = self.policy.streams(batch.observations, batch.actions)
+                losses = [
+                    stream_loss(
+                        now.log_probs[s],
+                        now.values[:, s],
+                        batch.actions[:, s],
+                        batch.old_log_probs[s],
+                        batch.advantages[:, s],
+                        batch.returns[:, s],
+                        batch.active[:, s],
+                        stream.clip_range,
+                        stream.ent_coef,
+                        stream.vf_coef,
+                        self.kl_coefs[s],
+                    )
+                    for s, stream in enumerate(settings)
+                ]
+                for records, part in zip(history, losses, strict=True):
+                    records.append(StreamLoss(*(term.detach() for term in part)))
+                kl = sum(float(records[-1].kl) for records in history)
+                if self.target_kl is not None and kl > 1.5 * self.target_kl:
+                    stopped = True
+                    break
+                # L = L_p + L_r (Eq. 9)
+                self._optimize(th.stack([part.loss for part in losses]).sum())
+                n_steps += 1
+            if stopped:
+                break
+            self._n_updates += 1
+        self._log_update(history, n_steps)
+
+    def _optimize(self, loss: th.Tensor) -> None:
+        """Take one step, unless it would destroy the weights."""
+        if not th.isfinite(loss):
+            raise FloatingPointError(
+                f"the loss is {float(loss)}: no step was taken; check rewards and observations, or "
+                "lower learning_rate"
+            )
+        self.policy.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
+        norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), limit)
+        if not th.isfinite(norm):
+            raise FloatingPointError(
+                f"the gradient norm is {float(norm)}: no step was taken; lower learning_rate"
+            )
+        self.policy.optimizer.step()
+
+    def _log_update(self, history: list[list[StreamLoss]], n_steps: int) -> None:
+        names = self.policy.stream_names
+        for s, (name, records) in enumerate(zip(names, history, strict=True)):
+            prefix = f"train/{name}_" if len(names) > 1 else "train/"
+            for field in StreamLoss._fields:
+                values = th.stack([getattr(record, field) for record in records])
+                self.logger.record(prefix + field, float(values.mean()))
+            values, returns = self.rollout_buffer.stream_arrays(s)
+            variance = explained_variance(values.flatten(), returns.flatten())
+            self.logger.record(prefix + "explained_variance", float(variance))
+            if self.kl_coefs[s] > 0:
+                kl = float(th.stack([record.kl for record in records]).mean())
+                self.logger.record(prefix + "kl_coef", self.kl_coefs[s])
+                self.kl_coefs[s] = adapt_kl_coef(self.kl_coefs[s], kl, self.kl_target)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/optimizer_steps", n_steps, exclude="tensorboard")
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """Write the log, with time counted in steps of teams and of robots."""
+        assert self.env is not None
+        n_agents = find_team_env(self.env).n_agents
+        self.logger.record("time/env_steps", self.num_timesteps // n_agents)
+        self.logger.record("time/agent_steps", self.num_timesteps)
+        super().dump_logs(iteration)
+
+    def learn(
+        self: SelfMAPPO,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "MAPPO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfMAPPO:
+        """Learn for a number of robot steps (joint steps times robots), as SB3 counts.
+
+        See ``OnPolicyAlgorithm.learn``.
+        """
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+
+def _check_positive(**values: int) -> None:
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+
+
+def _check_unit(**values: float) -> None:
+    for name, value in values.items():
+        if not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
+            raise ValueError(f"{name} must be a number in [0, 1], got {value!r}")
+
+
+def _check_not_negative(**values: Any) -> None:
+    for name, value in values.items():
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not number or not 0.0 <= value < float("inf"):
+            raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")

@@ -1,0 +1,236 @@
+"""What the commands share: the parser, types of options, and the options of a scene."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from area_search.scenes import Scene, SceneError, get_scene, unknown
+
+if TYPE_CHECKING:
+    Subparsers = argparse._SubParsersAction["Parser"]
+
+MAX_SEED = 2**63 - 1
+_INTEGER = re.compile(r"[+-]?[0-9]{1,100}")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,5})?")
+_CONSTANTS = {"true": True, "false": False, "null": None, "none": None, "~": None}
+
+
+class UsageError(ValueError):
+    """A wrong command line that only the command itself can notice; the message is one line."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line with the closest match, and exit code 2."""
+
+    def __init__(self, **options: Any) -> None:
+        options.setdefault("formatter_class", argparse.ArgumentDefaultsHelpFormatter)
+        # An abbreviation that works today is ambiguous once another option is added.
+        super().__init__(**options, allow_abbrev=False)
+        self.set_defaults(parser=self)
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit."""
+        self.exit(2, f"{self.prog}: error: {' '.join(message.split())}\n")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse, and refuse what is not known here: later it would be the top parser's error."""
+        args = list(sys.argv[1:] if args is None else args)
+        if args and args[0].startswith("-"):
+            # argparse would skip it, and take its value for the command.
+            self._check_option(args[0])
+        result, extra = super().parse_known_args(args, namespace)
+        if extra:
+            self._check_option(extra[0])
+            self.error(f"unexpected argument {extra[0]!r}")
+        return result, extra
+
+    def _check_option(self, given: str) -> None:
+        name = given.split("=")[0]
+        if name.startswith("-") and name not in self._option_string_actions:
+            options = [name for name in self._option_string_actions if name.startswith("--")]
+            self.error(unknown("option", name, options))
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            what = action.metavar if isinstance(action.metavar, str) else "value"
+            raise argparse.ArgumentError(None, unknown(what, value, action.choices))
+
+
+def one_of(what: str, allowed: Iterable[str]) -> Callable[[str], str]:
+    """Make the type of an option that takes one of some names.
+
+    :param what: the kind of thing that is named
+    :param allowed: the names that exist
+    """
+    names = tuple(allowed)
+
+    def name(text: str) -> str:
+        if text not in names:
+            raise argparse.ArgumentTypeError(unknown(what, text, names))
+        return text
+
+    return name
+
+
+def whole_number(low: int, high: int) -> Callable[[str], int]:
+    """Make the type of an option that takes a whole number from ``low`` to ``high``."""
+
+    def number(text: str) -> int:
+        value = int(text) if _INTEGER.fullmatch(text) else None
+        if value is None or not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f"must be a whole number from {low} to {high}, got {text!r}"
+            )
+        return value
+
+    return number
+
+
+def positive_number(high: float) -> Callable[[str], float]:
+    """Make the type of an option that takes a number above 0, up to ``high``."""
+
+    def number(text: str) -> float:
+        value = float(text) if _NUMBER.fullmatch(text) else 0.0
+        if not 0.0 < value <= high:
+            raise argparse.ArgumentTypeError(
+                f"must be a number above 0, up to {high:g}, got {text!r}"
+            )
+        return value
+
+    return number
+
+
+def output_file(*endings: str) -> Callable[[str], Path]:
+    """Make the type of an option that names a file to write; it is checked before the work.
+
+    :param endings: suffixes that are allowed, with the dot
+    """
+
+    def path(text: str) -> Path:
+        file = Path(text)
+        if file.suffix.lower() not in endings:
+            raise argparse.ArgumentTypeError(
+                f"the file must end in {' or '.join(endings)}, got {text!r}"
+            )
+        if file.is_dir():
+            raise argparse.ArgumentTypeError(f"{text!r} is a folder, name a file")
+        if not file.parent.is_dir():
+            raise argparse.ArgumentTypeError(f"folder {str(file.parent)!r} does not exist")
+        return file
+
+    return path
+
+
+def parse_value(text: str) -> Any:
+    """Read the value of a ``key:value`` argument.
+
+    Numbers (``5e-4`` too, which YAML 1.1 takes for text), ``true``, ``false`` and ``null`` or
+    ``none`` are what they look like; ``[...]``, ``{...}`` and quoted text are YAML; anything else
+    is text. So ``no`` and ``12:30`` stay text, which YAML would turn into False and 750.
+
+    :param text: the part after the colon
+    :return: the value
+    :raises ValueError: if it begins like YAML and is none, or PyYAML is not installed
+    """
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    if _NUMBER.fullmatch(text):
+        return float(text)
+    if text.lower() in _CONSTANTS:
+        return _CONSTANTS[text.lower()]
+    if not text.startswith(("[", "{", '"', "'")):
+        return text
+    try:
+        # By name: the stubs are not a requirement, and few commands need it at all.
+        yaml = import_module("yaml")
+    except ImportError:
+        raise ValueError(f"lists and quoted values need PyYAML, got {text!r}") from None
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ValueError(f"not valid YAML: {text!r}") from None
+
+
+def key_value(text: str) -> tuple[str, Any]:
+    """Read one ``key:value`` argument, as rl-zoo's ``--env-kwargs`` takes them.
+
+    :param text: ``key:value``
+    :return: key and value
+    :raises argparse.ArgumentTypeError: if it has another form
+    """
+    key, colon, value = text.partition(":")
+    if not (colon and value and key.isidentifier()):
+        raise argparse.ArgumentTypeError(f"must be key:value, such as horizon:100, got {text!r}")
+    try:
+        return key, parse_value(value)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{key}: {error}") from None
+
+
+class KeyValues(argparse.Action):
+    """Collect ``key:value`` arguments in a dict; use with ``type=key_value``, ``nargs="+"``."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the given pairs."""
+        collected = dict(getattr(namespace, self.dest) or {})
+        for key, value in values:
+            if key in collected:
+                raise argparse.ArgumentError(self, f"{key} is given twice")
+            collected[key] = value
+        setattr(namespace, self.dest, collected)
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--scene``, ``--n-agents`` and ``--scene-options``; read them with :func:`scene_of`."""
+    parser.add_argument("--scene", default="hard", help="name of a scene", metavar="NAME")
+    parser.add_argument(
+        "--n-agents",
+        type=int_text,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help="robots in the team (default: the scene's)",
+    )
+    parser.add_argument(
+        "--scene-options",
+        type=key_value,
+        nargs="+",
+        action=KeyValues,
+        default={},
+        metavar="KEY:VALUE",
+        help="fields of the scene to change, such as horizon:100 free_fraction:0.5",
+    )
+
+
+def int_text(text: str) -> int | str:
+    """Read a whole number, and leave anything else to the scene, which knows the range."""
+    return int(text) if _INTEGER.fullmatch(text) else text
+
+
+def scene_of(args: argparse.Namespace) -> Scene:
+    """Make the scene that the options of :func:`add_scene_options` describe.
+
+    :param args: parsed arguments
+    :return: the scene
+    :raises UsageError: if the name or a field is unknown, or a value is out of range
+    """
+    options = dict(args.scene_options)
+    if hasattr(args, "n_agents"):
+        if "n_agents" in options:
+            raise UsageError("give --n-agents or --scene-options n_agents:..., not both")
+        options["n_agents"] = args.n_agents
+    try:
+        return get_scene(args.scene, **options)
+    except SceneError as error:
+        raise UsageError(str(error)) from None

@@ -1,0 +1,269 @@
+"""The command line, as a user meets it: in a process of its own."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sb3_roles.baselines import CONTROLLER_NAMES
+from sb3_roles.zoo.bench_env import case_name, log_log_slope
+from sb3_roles.zoo.options import key_value, parse_value
+
+ROOT = Path(__file__).resolve().parents[1]
+COMMAND = [sys.executable, "-m", "sb3_roles"]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "envs"), str(ROOT)])}
+
+
+def sb3_roles(*args: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*COMMAND, *args], env=ENVIRONMENT, capture_output=True, text=True, timeout=120
+    )
+
+
+def simulate_json(*args: str) -> dict:
+    result = sb3_roles("simulate", "--json", *args)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(
+    "args", [["--help"], ["simulate", "--help"], ["bench", "--help"], ["bench", "env", "--help"]]
+)
+def test_help(args):
+    result = sb3_roles(*args)
+    assert result.returncode == 0
+    assert result.stdout.startswith("usage: sb3-roles")
+    assert result.stderr == ""
+
+
+WRONG = [
+    ([], "sb3-roles: error", "command"),
+    (["simulat"], "sb3-roles: error", "did you mean 'simulate'?"),
+    (["--sed", "3", "simulate"], "sb3-roles: error", "--sed"),
+    (["simulate", "--epsiodes", "5"], "sb3-roles simulate: error", "did you mean '--episodes'?"),
+    (["simulate", "extra"], "sb3-roles simulate: error", "'extra'"),
+    (["simulate", "--controller", "randm"], "sb3-roles simulate: error", "mean 'random'?"),
+    (["simulate", "--scene", "hrad"], "sb3-roles simulate: error", "did you mean 'hard'?"),
+    (["simulate", "--n-agents", "0"], "sb3-roles simulate: error", "from 1 to 1024, got 0"),
+    (["simulate", "--n-agents", "four"], "sb3-roles simulate: error", "got 'four'"),
+    (["simulate", "--n-agents", "2.5"], "sb3-roles simulate: error", "got '2.5'"),
+    (["simulate", "--episodes", "0"], "sb3-roles simulate: error", "--episodes: must be a whole"),
+    (["simulate", "--episodes", "many"], "sb3-roles simulate: error", "got 'many'"),
+    (["simulate", "--episodes", "9" * 5000], "sb3-roles simulate: error", "--episodes"),
+    (["simulate", "--episodes"], "sb3-roles simulate: error", "expected one argument"),
+    (["simulate", "--seed", "-1"], "sb3-roles simulate: error", "from 0 to"),
+    (["simulate", "--seed", "1\n2"], "sb3-roles simulate: error", "--seed"),
+    (["simulate", "--batch-size", "0"], "sb3-roles simulate: error", "--batch-size"),
+    (["simulate", "--first-episode", "-3"], "sb3-roles simulate: error", "--first-episode"),
+    (["simulate", "--scene-options", "horizn:9"], "sb3-roles simulate: error", "'horizon'?"),
+    (["simulate", "--scene-options", "horizon"], "sb3-roles simulate: error", "key:value"),
+    (["simulate", "--scene-options", "horizon:"], "sb3-roles simulate: error", "key:value"),
+    (["simulate", "--scene-options", "horizon:x"], "sb3-roles simulate: error", "got 'x'"),
+    (["simulate", "--scene-options", "free_fraction:nan"], "sb3-roles simulate: error", "'nan'"),
+    (["simulate", "--scene-options", "width:9", "width:8"], "sb3-roles simulate: error", "twice"),
+    (
+        ["simulate", "--n-agents", "3", "--scene-options", "n_agents:4"],
+        "sb3-roles simulate: error",
+        "not both",
+    ),
+    (["simulate", "--render", "x.bmp"], "sb3-roles simulate: error", ".png"),
+    (["simulate", "--render", "/nowhere/x.png"], "sb3-roles simulate: error", "'/nowhere'"),
+    (["bench"], "sb3-roles bench: error", "benchmark"),
+    (["bench", "evn"], "sb3-roles bench: error", "did you mean 'env'?"),
+    (["bench", "env", "--seconds-per-case", "0"], "sb3-roles bench env: error", "above 0"),
+    (["bench", "env", "--seconds-per-case", "inf"], "sb3-roles bench env: error", "'inf'"),
+    (["bench", "env", "--repeats", "-5"], "sb3-roles bench env: error", "--repeats"),
+]
+
+
+@pytest.mark.parametrize(("args", "start", "part"), WRONG)
+def test_wrong_command_line(args, start, part):
+    result = sb3_roles(*args)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith(start)
+    assert part in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_nothing_heavy_is_imported_before_the_arguments_are_right():
+    code = (
+        "import sys\n"
+        "from sb3_roles.zoo.cli import main\n"
+        "try: main(['simulate', '--scene', 'nowhere'])\n"
+        "except SystemExit as end: assert end.code == 2\n"
+        "heavy = {'torch', 'numba', 'numpy', 'pettingzoo', 'gymnasium', 'pygame'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("controller", CONTROLLER_NAMES)
+def test_simulate_json(controller):
+    report = simulate_json(
+        *("--controller", controller, "--scene", "easy", "--n-agents", "3", "--episodes", "30"),
+        *("--seed", "5", "--scene-options", "horizon:20", "free_fraction:0.7"),
+    )
+    config = report["config"]
+    assert config["controller"] == controller
+    assert (config["episodes"], config["seed"], config["first_episode"]) == (30, 5, 0)
+    assert config["version"]
+    scene = config["scene"]
+    assert (scene["name"], scene["n_agents"], scene["horizon"]) == ("easy", 3, 20)
+    assert scene["free_fraction"] == 0.7
+    metrics = report["metrics"]
+    for name in ("explo_paper", "explo_true", "cover"):
+        assert metrics[name]["unit"] == "%"
+        assert 0 < metrics[name]["mean"] < 100
+        assert 0 < metrics[name]["se"] < 10
+    assert set(metrics["time_e_paper"]) == {"mean", "se", "unit"}
+    assert set(metrics["t90_true"]) == {"mean", "se", "unit", "share"}
+    assert metrics["length"] == {"mean": 20.0, "se": 0.0, "unit": "steps"}
+    assert report["joint_steps"] == 600
+    assert report["episodes_per_second"] > 0
+
+
+def test_batch_size_changes_no_metric():
+    args = ("--episodes", "40", "--scene-options", "horizon:15")
+    one = simulate_json(*args, "--batch-size", "1")
+    many = simulate_json(*args, "--batch-size", "500")
+    assert one["metrics"] == many["metrics"]
+
+
+def test_simulate_table_and_frame(tmp_path):
+    frame = tmp_path / "frame.png"
+    result = sb3_roles("simulate", "--episodes", "5", "--render", str(frame))
+    assert result.returncode == 0
+    assert result.stderr == ""
+    assert "explo_paper" in result.stdout
+    assert "±" in result.stdout
+    assert frame.read_bytes().startswith(b"\x89PNG")
+
+
+def test_closed_pipe_ends_quietly():
+    read, write = os.pipe()
+    os.close(read)
+    result = subprocess.run(
+        [*COMMAND, "simulate", "--episodes", "2"],
+        env=ENVIRONMENT,
+        stdout=write,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    os.close(write)
+    assert (result.returncode, result.stderr) == (141, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_full_disk_is_one_line():
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [*COMMAND, "simulate", "--episodes", "2"],
+            env=ENVIRONMENT,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert result.returncode == 2
+    assert result.stderr == "sb3-roles simulate: error: No space left on device\n"
+
+
+def test_interrupt_ends_quietly():
+    process = subprocess.Popen(
+        [*COMMAND, "simulate", "--episodes", "400000"],
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(3)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=30)
+    assert (process.returncode, stdout, stderr) == (130, "", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3", 3),
+        ("-3", -3),
+        ("0.5", 0.5),
+        ("5e-4", 5e-4),
+        ("1e6", 1e6),
+        ("true", True),
+        ("None", None),
+        ("null", None),
+        ("same_role", "same_role"),
+        ("no", "no"),
+        ("12:30", "12:30"),
+    ],
+)
+def test_values(text, value):
+    parsed = parse_value(text)
+    assert parsed == value
+    assert type(parsed) is type(value)
+
+
+def test_yaml_values():
+    pytest.importorskip("yaml")
+    assert parse_value("[1, 2]") == [1, 2]
+    assert parse_value("'7'") == "7"
+    with pytest.raises(ValueError, match="not valid YAML"):
+        parse_value("[1, 2")
+
+
+@pytest.mark.parametrize("text", ["", ":", "a", ":1", "a:", "a b:1", "3:4"])
+def test_key_value_needs_both(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="key:value"):
+        key_value(text)
+
+
+def test_log_log_slope_of_a_power_law():
+    sizes = (1, 4, 15, 50)
+    assert log_log_slope(sizes, [3 * size**1.5 for size in sizes]) == pytest.approx(1.5)
+
+
+def test_bench_env_measures_everything():
+    result = sb3_roles("bench", "env", "--json", "--seconds-per-case", "0.001", "--repeats", "2")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["config"] == {"seconds_per_case": 0.001, "repeats": 2}
+    assert set(report["machine"]) >= {"cpu", "cores", "load_before", "python", "numpy", "numba"}
+    cases = {case["name"]: case for case in report["cases"]}
+    for sub_goal in ("none", "nearest", "assigned"):
+        for n_agents in (4, 15):
+            for side in (25, 100):
+                assert case_name("native", sub_goal, n_agents, side) in cases
+    for api in ("native_vec_env", "supersuit_vec_env", "pettingzoo", "reference"):
+        assert case_name(api, "none", 4, 25) in cases
+        assert report["ratios"][f"native / {api}"]["median"] > 1
+    for case in cases.values():
+        rate = case["joint_steps_per_second"]
+        assert 0 < rate["min"] <= rate["median"] <= rate["max"]
+        assert case["joint_steps"] >= 2 * case["n_teams"]
+        assert (rate["met"] is None) == (rate["target"] is None)
+    assert sum(case["joint_steps_per_second"]["met"] is not None for case in cases.values()) == 4
+    assert {(line["sub_goal"], line["along"]) for line in report["growth"]} == {
+        (sub_goal, along)
+        for sub_goal in ("none", "nearest", "assigned")
+        for along in ("robots", "side")
+    }
+    for line in report["growth"]:
+        assert len(line["sizes"]) == len(line["microseconds"]) == 4
+        assert isinstance(line["exponent"]["met"], bool)
+    assert set(report["compile"]["added"]) == {"none", "nearest", "assigned"}
+    total = report["compile"]["total"]
+    assert total["seconds"] == pytest.approx(sum(report["compile"]["added"].values()))
+    assert all(times["median"] > 0 for times in report["imports"].values())
