@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-import subprocess
-import sys
 import warnings
 from typing import Any, ClassVar
 
@@ -106,19 +104,6 @@ def test_gymnasium_and_sb3_accept_a_robot_on_its_own(sub_goal: str) -> None:
         # A class that is not registered has no spec to make other render modes from.
         warnings.filterwarnings("ignore", message=".*not having a spec")
         gymnasium_check_env(OneRobot(sub_goal=sub_goal, render_mode="rgb_array"))
-
-
-def test_the_usual_entry_point_of_pettingzoo() -> None:
-    # In a new interpreter, because the result must not depend on what was imported before.
-    code = (
-        "import area_search; from area_search import AreaSearchEnv, parallel_env; "
-        "from area_search import parallel_env as again; "
-        "assert parallel_env is again is area_search.parallel_env; "
-        "env = parallel_env(scene='easy', n_agents=2); "
-        "assert isinstance(env, AreaSearchEnv) and len(env.possible_agents) == 2"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
 
 
 def test_sb3_does_not_take_the_maps_for_pictures() -> None:

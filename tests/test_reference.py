@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from area_search import BatchedAreaSearch, Scene
 from area_search.reference import ReferenceAreaSearch
 

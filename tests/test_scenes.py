@@ -114,8 +114,8 @@ BAD_TEXTS = [
     ("reward_sharing", "Own", ("own, same_role", "did you mean 'own'")),
     ("reward_sharing", None, ("own, same_role",)),
     ("reward_sharing", ["own"], ("own, same_role",)),
-    ("name", "", ("non-empty text",)),
-    ("name", 3, ("non-empty text",)),
+    ("name", "", ("letters, digits",)),
+    ("name", 3, ("letters, digits",)),
 ]
 BAD_FIELDS = [
     *BAD_INTEGERS,

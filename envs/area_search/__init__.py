@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from area_search.batch import BatchedAreaSearch
-    from area_search.parallel_env import AreaSearchEnv, parallel_env
+    from area_search.parallel_env import AreaSearchEnv
     from area_search.scenes import SCENES, Scene, SceneError, get_scene
 
 __all__ = [
@@ -17,12 +17,10 @@ __all__ = [
     "Scene",
     "SceneError",
     "get_scene",
-    "parallel_env",
 ]
 
 _HOME = {
     "AreaSearchEnv": "parallel_env",
-    "parallel_env": "parallel_env",
     "BatchedAreaSearch": "batch",
     "SCENES": "scenes",
     "Scene": "scenes",

@@ -14,7 +14,9 @@ from area_search.cells import N_ACTIONS
 from area_search.random_streams import seed_key
 from area_search.render import Snapshot, Window, draw_frame
 from area_search.rewards import MAX_ROLES, REWARD_COMPONENTS
-from area_search.scenes import Scene, get_scene, unknown
+from area_search.scenes import Scene, get_scene, shown, unknown
+
+MAX_EPISODE = 2**62
 
 # Everything that the future of a run depends on, and what the last step reported. All else is
 # derived from it.
@@ -101,6 +103,7 @@ class BatchedAreaSearch:
         self.observation_space = observation_space(self.scene, sub_goal)
         self.action_space = spaces.Discrete(N_ACTIONS)
         self._window: Window | None = None
+        self._started = False
         self._allocate()
 
     def _allocate(self) -> None:
@@ -225,36 +228,35 @@ class BatchedAreaSearch:
         :param seed: one seed for all teams, which then share its numbered episodes in turn: team
             ``m`` plays episodes m, m + n_teams, m + 2 n_teams, ...; or a seed per team, each with
             its own episodes 0, 1, 2, ...
-        :param episode: number of the first episode of each team, or of all; by default as above
+        :param episode: number of the first episode to deal out or, with a seed per team, of every
+            team; or one for each team
         :raises ValueError: if a seed or an episode is negative, or their number is not ``n_teams``
         """
-        shared = isinstance(seed, (int, np.integer))
-        seeds = [int(seed)] if isinstance(seed, (int, np.integer)) else list(seed)
+        shared = np.ndim(seed) == 0
+        seeds = [seed] if shared else list(seed)  # type: ignore[arg-type]
         if not shared and len(seeds) != self.n_teams:
             raise ValueError(
                 f"seed must be one number or one for each of the {self.n_teams} teams, "
                 f"got {len(seeds)}"
             )
-        first = np.arange(self.n_teams) if shared else np.zeros(self.n_teams, np.int64)
-        if episode is not None:
-            given = np.asarray(episode)
-            if given.shape not in ((), (self.n_teams,)) or given.dtype.kind not in "iu":
-                raise ValueError(
-                    f"episode must be one whole number or one for each of the {self.n_teams} "
-                    f"teams, got {episode!r}"
-                )
-            if given.min() < 0:
-                raise ValueError(f"episode must be at least 0, got {int(given.min())}")
-            first = np.broadcast_to(given, (self.n_teams,))
-        self.keys[:] = [seed_key(one) for one in seeds]
-        self.episodes[:] = first
-        self.episode_stride[:] = self.n_teams if shared and episode is None else 1
+        keys = [seed_key(one) for one in seeds]
+        given = np.asarray(0 if episode is None else episode)
+        if given.shape not in ((), (self.n_teams,)) or given.dtype.kind not in "iu":
+            raise ValueError(
+                f"episode must be one whole number or one for each of the {self.n_teams} "
+                f"teams, got {shown(episode)}"
+            )
+        if given.min() < 0 or given.max() > MAX_EPISODE:
+            raise ValueError(f"episode must be from 0 to {MAX_EPISODE}, got {shown(episode)}")
+        dealt = shared and given.ndim == 0
+        self.keys[:] = keys
+        self.episodes[:] = given + np.arange(self.n_teams) if dealt else given
+        self.episode_stride[:] = self.n_teams if shared else 1
         for array in (self.new_cells, self.new_targets, self.reward_components, self.rewards):
             array[:] = 0
         self.metric_values[:] = 0
         self.terminated[:] = False
         self.truncated[:] = False
-        self.roles[:] = 0
         self._begin(self._everyone)
 
     def reset_teams(self, which: np.ndarray) -> None:
@@ -262,6 +264,7 @@ class BatchedAreaSearch:
 
         :param which: bool (n_teams,)
         """
+        self._check_started()
         which = np.asarray(which)
         if which.shape != (self.n_teams,) or which.dtype != np.bool_:
             raise ValueError(
@@ -273,6 +276,8 @@ class BatchedAreaSearch:
 
     def _begin(self, which: np.ndarray) -> None:
         kernels.reset_teams(which, *self._reset_arguments)
+        self.roles[which] = 0
+        self._started = True
         self._observe(which)
 
     def step(self, actions: np.ndarray) -> None:
@@ -285,8 +290,13 @@ class BatchedAreaSearch:
         :param actions: integer (n_teams, n_agents), indices into ``cells.ACTIONS``
         :raises ValueError: if the shape, type or a value is wrong
         """
+        self._check_started()
         kernels.step_teams(self._checked_actions(actions), *self._step_arguments)
         self._observe(self._everyone)
+
+    def _check_started(self) -> None:
+        if not self._started:
+            raise ValueError("call reset() first: there is no episode yet")
 
     def _checked_actions(self, actions: np.ndarray) -> np.ndarray:
         actions = np.asarray(actions)
@@ -355,10 +365,12 @@ class BatchedAreaSearch:
         position, roles = np.asarray(state["position"]), np.asarray(state["roles"])
         if np.any(position < 0) or np.any(position >= (self.scene.height, self.scene.width)):
             raise ValueError("state does not fit: a position is not on the map")
+        self._check_cells(np.asarray(state["cells"]), position)
         if np.any(roles < 0) or np.any(roles >= MAX_ROLES):
             raise ValueError(f"state does not fit: roles must be in 0..{MAX_ROLES - 1}")
         for name in _STATE_ARRAYS:
             getattr(self, name)[:] = state[name]
+        self._started = True
         for m in range(self.n_teams):
             kernels.rebuild(
                 self.cells[m],
@@ -370,14 +382,33 @@ class BatchedAreaSearch:
             )
         self._observe(self._everyone)
 
+    def _check_cells(self, cells: np.ndarray, position: np.ndarray) -> None:
+        # Moves and searches rely on the border instead of checking bounds.
+        inside = np.zeros(cells.shape[1:], np.bool_)
+        inside[self._border : -self._border, self._border : -self._border] = True
+        if np.any(cells[:, ~inside] != layout.BORDER):
+            raise ValueError("state does not fit: the maps have another size or border")
+        row, column = position[..., 0] + self._border, position[..., 1] + self._border
+        under = cells[np.arange(self.n_teams)[:, None], row, column]
+        if np.any(under & layout.OBSTACLE):
+            raise ValueError("state does not fit: a robot is on an obstacle")
+
     # Pickling (SuperSuit copies environments that way) would tear the views of one memory apart.
     def __getstate__(self) -> dict[str, Any]:
         options = {"scene": self.scene, "n_teams": self.n_teams, "sub_goal": self.sub_goal}
-        return {"options": options, "arrays": self.get_state()}
+        return {"options": options, "arrays": self.get_state() if self._started else None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state["options"])  # type: ignore[misc]
-        self.set_state(state["arrays"])
+        if state["arrays"] is not None:
+            self.set_state(state["arrays"])
+
+    def _metrics_so_far(self, team: int) -> dict[str, float]:
+        """Metrics of the running episode; ``metrics`` are those of the last step."""
+        values = np.zeros(len(kernels.METRICS))
+        scene = self.scene
+        kernels.measure(self.totals[team], scene.n_free, scene.n_targets, values)
+        return dict(zip(kernels.METRICS, values.tolist(), strict=True))
 
     def episode_metrics(self, team: int) -> dict[str, float]:
         """Metrics of one team's episode so far; after its last step, those of the episode.
@@ -388,7 +419,7 @@ class BatchedAreaSearch:
             the targets covered), ``t90_paper`` and ``t90_true`` (0-based first step with
             explo_paper > 0.9 and explo_true >= 0.9; -1: never), ``length`` in steps
         """
-        values = {name: float(self.metrics[name][team]) for name in kernels.METRICS}
+        values = self._metrics_so_far(team)
         values["t90_paper"] = int(self.totals[team, kernels.T90_PAPER])
         values["t90_true"] = int(self.totals[team, kernels.T90_TRUE])
         values["length"] = int(self.steps[team])
@@ -420,7 +451,7 @@ class BatchedAreaSearch:
             "title": f"{scene.name}, {scene.n_agents} robots",
             "step": int(self.steps[team]),
             "horizon": scene.horizon,
-            "metrics": {name: float(self.metrics[name][team]) for name in kernels.METRICS},
+            "metrics": self._metrics_so_far(team),
             "sensor_radius": float(scene.sensor_radius),
             "view_radius": scene.view_radius,
             "communication_radius": float(scene.communication_radius),

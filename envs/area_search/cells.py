@@ -19,6 +19,8 @@ OBSTACLE = 32
 TARGET = 64
 COVERED = 128
 
+BORDER = EXPLORED | OBSTACLE | KNOWN_OBSTACLE
+
 LOCAL_CHANNELS = ("obstacle", "frontier", "target", "robot")
 JOINT_CHANNELS = ("frontier", "target")
 STATE_CHANNELS = ("obstacle", "frontier", "target", "robot", "explored")

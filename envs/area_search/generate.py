@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from area_search.cells import (
+    BORDER,
     COVERED,
     EXPLORED,
     KNOWN_OBSTACLE,
@@ -61,7 +62,7 @@ def generate_episode(
     first, second = key[0], episode_key(key, episode)
     counter = np.uint64(0)
 
-    cells[:] = EXPLORED | OBSTACLE | KNOWN_OBSTACLE
+    cells[:] = BORDER
     cells[border : border + height, border : border + width] = OBSTACLE
 
     seed_row = int(to_unit(draw(first, second, counter)) * height)

@@ -194,6 +194,14 @@ def _sense(
 
 
 @njit(cache=True)
+def measure(totals: np.ndarray, n_free: int, n_targets: int, out: np.ndarray) -> None:
+    """Write the metrics of one team's episode so far, in the order of ``METRICS``."""
+    out[0] = totals[SEEN] / n_free
+    out[1] = totals[SEEN_FREE] / n_free
+    out[2] = totals[COVERED_SCORED] / n_targets
+
+
+@njit(cache=True)
 def first_invalid(actions: np.ndarray, n_actions: int) -> int:
     """Return the flat index of the first action outside 0..n_actions - 1, or -1."""
     flat = actions.reshape(-1)
@@ -297,9 +305,7 @@ def step_teams(
         steps[m] += 1
         terminated[m] = stuck
         truncated[m] = steps[m] >= horizon
-        metrics[m, 0] = totals[m, SEEN] / n_free
-        metrics[m, 1] = totals[m, SEEN_FREE] / n_free
-        metrics[m, 2] = totals[m, COVERED_SCORED] / n_targets
+        measure(totals[m], n_free, n_targets, metrics[m])
         if totals[m, T90_PAPER] == NEVER and metrics[m, 0] > 0.9:
             totals[m, T90_PAPER] = steps[m] - 1
         if totals[m, T90_TRUE] == NEVER and metrics[m, 1] >= 0.9:

@@ -11,10 +11,9 @@ from pettingzoo import ParallelEnv
 
 from area_search import kernels
 from area_search.batch import BatchedAreaSearch
-from area_search.cells import N_ACTIONS
 from area_search.render import Window, draw_frame
 from area_search.rewards import REWARD_COMPONENTS
-from area_search.scenes import Scene, get_scene, unknown
+from area_search.scenes import Scene, get_scene, shown, unknown
 
 _TEAM_KEYS = BatchedAreaSearch.team_observation_keys
 
@@ -116,6 +115,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         """
         options = dict(options or {})
         episode = options.pop("episode", None)
+        options.pop("options", None)  # what PettingZoo's own API test passes
         if options:
             raise ValueError(unknown("reset option", next(iter(options)), ["episode"]))
         if seed is None and not self._seeded:
@@ -147,10 +147,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         if not self.agents:
             raise ValueError("the episode has ended: call reset() before step()")
         batch, agents = self._batch, self.agents
-        try:
-            moves = np.array([[actions[agent] for agent in agents]])
-        except KeyError as error:
-            raise ValueError(f"actions must hold one for each robot, none for {error}") from None
+        moves = self._moves(actions)
         batch.step(moves)
         if self.render_mode is not None:
             self._path.append(batch.position[0].copy())
@@ -172,6 +169,26 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         if self.render_mode == "human":
             self.render()
         return observations, rewards, terminations, truncations, infos
+
+    def _moves(self, actions: Mapping[str, int]) -> np.ndarray:
+        """Return one row of actions in the robots' order, or say whose is missing or wrong."""
+        try:
+            moves = np.array([[actions[agent] for agent in self.agents]])
+        except (KeyError, ValueError):
+            moves = np.empty(0)
+        if moves.shape == (1, len(actions)) and moves.dtype.kind in "iu":
+            return moves
+        for agent in actions:
+            if agent not in self.possible_agents:
+                raise ValueError(unknown("robot in actions", agent, self.possible_agents))
+        for agent in self.agents:
+            if agent not in actions:
+                raise ValueError(f"actions must hold one for each robot, none for {agent!r}")
+            if np.ndim(actions[agent]) or np.asarray(actions[agent]).dtype.kind not in "iu":
+                raise ValueError(
+                    f"the action of {agent!r} must be a whole number, got {shown(actions[agent])}"
+                )
+        return moves
 
     def _observations(self) -> ObsDict:
         # One copy of each array for the whole team: observations stay valid for ever, and the
@@ -242,13 +259,12 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         self._window.show(frame, self.metadata["render_fps"])
         return None
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A window can not be copied; a copy opens its own.
+        return {**self.__dict__, "_window": None}
+
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._window is not None:
             self._window.close()
             self._window = None
-
-
-def parallel_env(**options: Any) -> AreaSearchEnv:
-    """Make the environment from keyword arguments: PettingZoo's usual entry point."""
-    return AreaSearchEnv(**options)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from dataclasses import dataclass, fields, replace
+from numbers import Integral, Real
 from typing import Any
 
 MIN_SIZE, MAX_SIZE = 5, 1024
@@ -68,8 +70,12 @@ class Scene:
     beta: float = 0.6
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.name, str) and self.name):
-            raise SceneError(f"scene field name must be a non-empty text, got {self.name!r}")
+        # It becomes part of file names.
+        if not (isinstance(self.name, str) and re.fullmatch(r"[\w.-]+", self.name)):
+            raise SceneError(
+                "scene field name must be letters, digits, '_', '-' and '.', "
+                f"got {shown(self.name)}"
+            )
         for field, low, high in (
             ("height", MIN_SIZE, MAX_SIZE),
             ("width", MIN_SIZE, MAX_SIZE),
@@ -79,7 +85,7 @@ class Scene:
         ):
             self._check_integer(field, low, high)
         if self.early_stop_patience is not None:
-            self._check_integer("early_stop_patience", 1, MAX_HORIZON)
+            self._check_integer("early_stop_patience", 1, MAX_HORIZON, " or None")
         for field, bottom, top in (
             ("spawn_sigma", 0.0, 1e6),
             ("spawn_sigma_growth", 1e-6, 1e6),
@@ -97,25 +103,30 @@ class Scene:
                 f"scene field n_targets must be between 1 and the {self.n_free} free cells "
                 f"({self.free_fraction:g} of {self.height} x {self.width}), got {self.n_targets}"
             )
-        if self.reward_sharing not in REWARD_SHARING:
+        if not isinstance(self.reward_sharing, str) or self.reward_sharing not in REWARD_SHARING:
             raise SceneError(unknown("reward_sharing", self.reward_sharing, REWARD_SHARING))
 
-    def _check_integer(self, field: str, low: int, high: int) -> None:
+    def _check_integer(self, field: str, low: int, high: int, or_else: str = "") -> None:
         value = getattr(self, field)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not whole or not low <= value <= high:
             raise SceneError(
-                f"scene field {field} must be a whole number from {low} to {high}, got {value!r}"
+                f"scene field {field} must be a whole number from {low} to {high}{or_else}, "
+                f"got {shown(value)}"
             )
+        # A numpy number becomes a plain one: a scene is data, to be written as text.
+        object.__setattr__(self, field, int(value))
 
     def _check_number(self, field: str, low: float, high: float, open_low: bool = False) -> None:
         value = getattr(self, field)
-        valid = not isinstance(value, bool) and isinstance(value, (int, float))
+        valid = isinstance(value, Real) and not isinstance(value, bool)
         if not valid or not (low < value if open_low else low <= value) or not value <= high:
             bracket = "(" if open_low else "["
             raise SceneError(
                 f"scene field {field} must be a number in {bracket}{low:g}, {high:g}], "
-                f"got {value!r}"
+                f"got {shown(value)}"
             )
+        object.__setattr__(self, field, float(value))
 
     @property
     def n_cells(self) -> int:
@@ -147,6 +158,15 @@ class Scene:
         return replace(self, **options)
 
 
+def shown(value: object) -> str:
+    """Show any value on one short line, for error messages.
+
+    :param value: anything
+    """
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def unknown(what: str, given: object, allowed: Any) -> str:
     """One line saying that a name is not known, what is allowed, and the closest match.
 
@@ -158,7 +178,7 @@ def unknown(what: str, given: object, allowed: Any) -> str:
     names = [str(name) for name in allowed]
     close = difflib.get_close_matches(str(given), names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"unknown {what} {given!r}: allowed are {', '.join(names)}{hint}"
+    return f"unknown {what} {shown(given)}: allowed are {', '.join(names)}{hint}"
 
 
 # Targets are fractions of all 625 cells: 56, 24, 16 and 8 % (Tables I-III); the obstacles_* rows
