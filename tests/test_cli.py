@@ -258,7 +258,7 @@ def test_bench_env_measures_everything():
     assert {(line["sub_goal"], line["along"]) for line in report["growth"]} == {
         (sub_goal, along)
         for sub_goal in ("none", "nearest", "assigned")
-        for along in ("robots", "side")
+        for along in ("robots", "cells")
     }
     for line in report["growth"]:
         assert len(line["sizes"]) == len(line["microseconds"]) == 4

@@ -233,7 +233,7 @@ class BatchedAreaSearch:
         :raises ValueError: if a seed or an episode is negative, or their number is not ``n_teams``
         """
         shared = np.ndim(seed) == 0
-        seeds = [seed] if shared else list(seed)  # type: ignore[arg-type]
+        seeds: list[Any] = [seed] if shared else list(seed)  # type: ignore[arg-type]
         if not shared and len(seeds) != self.n_teams:
             raise ValueError(
                 f"seed must be one number or one for each of the {self.n_teams} teams, "

@@ -264,9 +264,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         last = last_values.detach().view(-1, 1)
         self.compute_stream_returns(last, gamma, gae_lambda, normalize_advantage=False)
 
-    def get(  # type: ignore[override]
-        self, batch_size: int | None = None
-    ) -> Generator[DictRolloutBufferSamples, None, None]:
+    def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:
         """Go once through the rollout.
 
         :param batch_size: rows per minibatch, rounded down to whole teams; None for all
@@ -292,12 +290,12 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         return arrays[0].cpu().numpy(), arrays[1].cpu().numpy()
 
     # DictRolloutBuffer has these as attributes, which stock algorithms read.
-    @property
+    @property  # type: ignore[override]
     def values(self) -> Any:
         """Values of the first stream, float32 (T, n)."""
         return self._first_stream(self._values)
 
-    @property
+    @property  # type: ignore[override]
     def returns(self) -> Any:
         """Returns of the first stream, float32 (T, n)."""
         return self._first_stream(self._returns)

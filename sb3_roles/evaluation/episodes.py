@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 NEVER = kernels.NEVER
 METRICS = kernels.METRICS
+NO_ROLE = -1
 
 
 # Without eq=False the generated comparison would ask for the truth value of whole arrays.
@@ -31,6 +32,8 @@ class EpisodeRecords:
     :param t90_true: int64 (E,), 0-based first step with explo_true >= 0.9, -1 for never
     :param t90_paper: int64 (E,), 0-based first step with explo_paper > 0.9, -1 for never
     :param seconds: wall time of the simulation, compilation excluded
+    :param roles: int8 (E, horizon, N), role of each robot in step t + 1; -1 after the end of the
+        episode, and everywhere for controllers without roles
     """
 
     episode: np.ndarray
@@ -39,6 +42,7 @@ class EpisodeRecords:
     t90_true: np.ndarray
     t90_paper: np.ndarray
     seconds: float
+    roles: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0), np.int8))
 
 
 class Player:
@@ -80,6 +84,11 @@ class Player:
         self._episode_start[:] = False
         batch.step(actions.reshape(batch.n_teams, batch.n_agents))
 
+    @property
+    def roles(self) -> np.ndarray | None:
+        """Int8 (n_teams, n_agents), the roles of the last step, if the controller has any."""
+        return getattr(self._controller, "roles", None)
+
 
 def row_observations(batch: BatchedAreaSearch) -> dict[str, np.ndarray]:
     """Return the observations with one row per robot, contiguous by team, as SB3 models take them.
@@ -104,7 +113,7 @@ def run_episodes(
     seed: int,
     first_episode: int = 0,
     batch_size: int = 256,
-    sub_goal: str = "none",
+    sub_goal: str | None = None,
     deterministic: bool = False,
 ) -> EpisodeRecords:
     """Play episodes ``first_episode`` .. ``first_episode + n_episodes - 1`` of a seed's stream.
@@ -118,7 +127,8 @@ def run_episodes(
     :param seed: seed of the stream
     :param first_episode: number of the first one
     :param batch_size: teams that are simulated together
-    :param sub_goal: path features in the observation, see ``area_search.paths``
+    :param sub_goal: path features in the observation, see ``area_search.paths``; by default those
+        that the controller names in its own ``sub_goal``, or none
     :param deterministic: handed to the controller
     :return: the records, in the order of the episodes
     :raises ValueError: if a number is out of range
@@ -139,7 +149,10 @@ def run_episodes(
         t90_true=np.full(n_episodes, NEVER, np.int64),
         t90_paper=np.full(n_episodes, NEVER, np.int64),
         seconds=0.0,
+        roles=np.full((*shape, scene.n_agents), NO_ROLE, np.int8),
     )
+    if sub_goal is None:
+        sub_goal = str(getattr(controller, "sub_goal", "none"))
     _warm_up(controller, scene, seed, sub_goal)
     start = time.perf_counter()
     batch: BatchedAreaSearch | None = None
@@ -172,6 +185,8 @@ def _play(player: Player, batch: BatchedAreaSearch, records: EpisodeRecords, row
         for name, values in batch.metrics.items():
             curve = records.curves[name][rows]
             curve[:, t] = values if t == 0 else np.where(playing, values, curve[:, t - 1])
+        if player.roles is not None:
+            records.roles[rows][playing, t] = player.roles[playing]
         ended = playing & (batch.terminated | batch.truncated)
         if not ended.any():
             continue

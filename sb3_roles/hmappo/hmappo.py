@@ -31,8 +31,8 @@ class HMAPPO(MAPPO):
     ``role_...`` those of the role stream, by default the same.
 
     :param policy: ``"RolePolicy"``, or a subclass of ``RoleActorCriticPolicy``
-    :param env: an environment of ``make_team_vec_env``, best wrapped in
-        :class:`~sb3_roles.common.role_wrapper.RoleWrapper`; without, it is wrapped with its defaults
+    :param env: an environment of ``make_team_vec_env``, best in a
+        :class:`~sb3_roles.common.role_wrapper.RoleWrapper`; else it gets one with its defaults
     :param role_gamma: discount of the role stream
     :param role_gae_lambda: lambda of the role stream
     :param role_clip_range: epsilon of the role stream; a number or a schedule

@@ -197,16 +197,14 @@ class RoleActorCriticPolicy(TeamPolicy):
             active,
         )
 
-    def get_distribution(  # type: ignore[override]
-        self, obs: th.Tensor | Observation
-    ) -> RoleDistribution:
+    def get_distribution(self, obs: th.Tensor | Observation) -> RoleDistribution:
         """Return the joint distribution over role and move of whole teams."""
         with self._autocast():
             role_log_probs, own = self._actor_features(obs, {})  # type: ignore[arg-type]
             move_log_probs = F.log_softmax(self.action_net(own).float(), dim=2)
         return RoleDistribution().proba_distribution(role_log_probs, move_log_probs)
 
-    def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:  # type: ignore[override]
+    def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:
         """Return the role values of any rows, float (n, 1)."""
         with self._autocast():
             return self._role_values(obs, {})  # type: ignore[arg-type]

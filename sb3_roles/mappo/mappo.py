@@ -250,7 +250,7 @@ class MAPPO(OnPolicyAlgorithm):
         with th.inference_mode():
             values = self.policy.streams(obs_as_tensor(stacked, self.device)).expected_values  # type: ignore[arg-type]
         gamma = th.tensor([s.gamma for s in self._settings()], device=self.device)
-        stream_rewards[rows] += gamma * values
+        stream_rewards[th.as_tensor(rows, device=self.device)] += gamma * values
 
     def train(self) -> None:
         """Update the policy on the rollout."""
@@ -315,8 +315,8 @@ class MAPPO(OnPolicyAlgorithm):
         for s, (name, records) in enumerate(zip(names, history, strict=True)):
             prefix = f"train/{name}_" if len(names) > 1 else "train/"
             for field in StreamLoss._fields:
-                values = th.stack([getattr(record, field) for record in records])
-                self.logger.record(prefix + field, float(values.mean()))
+                terms = th.stack([getattr(record, field) for record in records])
+                self.logger.record(prefix + field, float(terms.mean()))
             values, returns = self.rollout_buffer.stream_arrays(s)
             variance = explained_variance(values.flatten(), returns.flatten())
             self.logger.record(prefix + "explained_variance", float(variance))

@@ -99,15 +99,13 @@ class TeamActorCriticPolicy(TeamPolicy):
         active = th.ones_like(actions, dtype=th.bool)
         return Streams(actions, (log_probs,), values, values, active)
 
-    def get_distribution(  # type: ignore[override]
-        self, obs: th.Tensor | Observation
-    ) -> CategoricalDistribution:
+    def get_distribution(self, obs: th.Tensor | Observation) -> CategoricalDistribution:
         """Return the distribution over moves of whole teams."""
         with self._autocast():
             log_probs = self._log_probs(obs, {})  # type: ignore[arg-type]
         return CategoricalDistribution(log_probs.shape[1]).proba_distribution(log_probs)
 
-    def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:  # type: ignore[override]
+    def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:
         """Return the values of any rows, float (n, 1)."""
         with self._autocast():
             return self._values(obs, {})  # type: ignore[arg-type]

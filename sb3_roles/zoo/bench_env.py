@@ -8,34 +8,20 @@ from __future__ import annotations
 
 import json
 import operator
-import os
-import platform
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from importlib.metadata import version
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from area_search.scenes import Scene, get_scene
-from sb3_roles._version import __version__
-from sb3_roles.zoo.options import UsageError, positive_number, whole_number
+from sb3_roles.zoo.env_cases import ROBOTS, SIDES, SUB_GOALS, Case, case_name, make_cases
+from sb3_roles.zoo.machine import describe_machine, fresh_python
+from sb3_roles.zoo.options import positive_number, whole_number
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from sb3_roles.zoo.options import Subparsers
 
-SUB_GOALS = ("none", "nearest", "assigned")
-N_TEAMS, N_TEAMS_SUPERSUIT = 128, 8
-ROBOTS, SIDES = (1, 4, 15, 50), (25, 50, 100, 200)
-TARGET_DENSITY = 0.16
-
-# What DESIGN and PERFORMANCE ask for; reported as met or missed, never asserted.
+# What the project aims at; reported as met or missed, never asserted.
 RATE_TARGETS = {
     "native none 4 robots 25x25": 300_000,
     "native nearest 4 robots 25x25": 100_000,
@@ -65,49 +51,6 @@ start = time.perf_counter()
 {statement}
 print(time.perf_counter() - start)
 """
-
-
-@dataclass
-class Case:
-    """One thing to measure.
-
-    :param api: how the environment is run
-    :param scene: the task
-    :param sub_goal: path features in the observation
-    :param n_teams: teams that are stepped together
-    :param work: does some whole number of joint steps and returns it
-    """
-
-    api: str
-    scene: Scene
-    sub_goal: str
-    n_teams: int
-    work: Callable[[], int]
-    rates: list[float] = field(default_factory=list)
-    cpu_shares: list[float] = field(default_factory=list)
-    joint_steps: int = 0
-
-    @property
-    def name(self) -> str:
-        """What the case is called in reports."""
-        return case_name(self.api, self.sub_goal, self.scene.n_agents, self.scene.width)
-
-    def measure(self, seconds: float) -> None:
-        """Work for at least some time, and add the rate to ``rates``."""
-        done, elapsed = 0, 0.0
-        cpu, start = time.process_time(), time.perf_counter()
-        while elapsed < seconds:
-            done += self.work()
-            elapsed = time.perf_counter() - start
-        self.rates.append(done / elapsed)
-        self.cpu_shares.append((time.process_time() - cpu) / elapsed)
-        self.joint_steps += done
-
-
-def case_name(api: str, sub_goal: str, n_agents: int, side: int) -> str:
-    """Name a case."""
-    plural = "" if n_agents == 1 else "s"
-    return f"{api} {sub_goal} {n_agents} robot{plural} {side}x{side}"
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -159,150 +102,6 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def describe_machine() -> dict[str, Any]:
-    """Describe what the measurement runs on; call it before the work, for the load average.
-
-    :return: CPU, cores, load average of the last minute, versions
-    """
-    cpu = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            names = [
-                line.split(":", 1)[1].strip() for line in file if line.startswith("model name")
-            ]
-        cpu = names[0] if names else cpu
-    except OSError:
-        pass  # not Linux
-    affinity = getattr(os, "sched_getaffinity", None)
-    return {
-        "cpu": cpu,
-        "cores": os.cpu_count(),
-        "usable_cores": len(affinity(0)) if affinity else os.cpu_count(),
-        "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "python": platform.python_version(),
-        "numpy": version("numpy"),
-        "numba": version("numba"),
-        "sb3_roles": __version__,
-    }
-
-
-def make_cases() -> dict[str, Case]:
-    """Make every case, ready to run.
-
-    :return: by name
-    """
-    cases: list[Case] = []
-    sizes = {(n, side) for n in (4, 15) for side in (25, 100)}
-    sizes |= {(n, SIDES[0]) for n in ROBOTS} | {(4, side) for side in SIDES}
-    for sub_goal in SUB_GOALS:
-        for n_agents, side in sorted(sizes, key=lambda size: (size[1], size[0])):
-            cases.append(_native(make_scene(n_agents, side), sub_goal))
-    scene = make_scene(4, 25)
-    cases.append(_vec_env(scene, "native", N_TEAMS))
-    cases.append(_vec_env(scene, "supersuit", N_TEAMS_SUPERSUIT))
-    cases.append(_pettingzoo(scene))
-    cases.append(_reference(scene))
-    return {case.name: case for case in cases}
-
-
-def make_scene(n_agents: int, side: int) -> Scene:
-    """Make the hard scene with another team and map, at the same densities and horizon."""
-    n_targets = round(TARGET_DENSITY * side * side)
-    return get_scene("hard", n_agents=n_agents, height=side, width=side, n_targets=n_targets)
-
-
-def _actions(shape: tuple[int, ...]) -> Iterator[np.ndarray]:
-    import numpy as np
-
-    # A prime number of them, which no horizon is a multiple of.
-    drawn = np.random.default_rng(0).integers(0, 5, (101, *shape))
-    while True:
-        yield from drawn
-
-
-def _native(scene: Scene, sub_goal: str) -> Case:
-    import numpy as np
-
-    from area_search import BatchedAreaSearch
-
-    batch = BatchedAreaSearch(scene, N_TEAMS, sub_goal)
-    batch.reset(0)
-    actions = _actions((N_TEAMS, scene.n_agents))
-    # One horizon in which every team is reset once, each share of them at another step: from then
-    # on the resets, which cost many times a step, are spread evenly.
-    for step in range(scene.horizon):
-        batch.step(next(actions))
-        batch.reset_teams(np.arange(N_TEAMS) % scene.horizon == step)
-
-    def work() -> int:
-        batch.step(next(actions))
-        ended = batch.terminated | batch.truncated
-        if ended.any():
-            batch.reset_teams(ended)
-        return N_TEAMS
-
-    return Case("native", scene, sub_goal, N_TEAMS, work)
-
-
-def _vec_env(scene: Scene, backend: str, n_teams: int) -> Case:
-    from area_search import AreaSearchEnv
-    from sb3_roles.common.team_vec_env import make_team_vec_env
-
-    vec_env = make_team_vec_env(lambda: AreaSearchEnv(scene), n_teams, 0, backend)
-    vec_env.reset()
-    actions = _actions((n_teams * scene.n_agents,))
-
-    # Whole episodes, here and below: the teams are all reset at the same step.
-    def work() -> int:
-        for _ in range(scene.horizon):
-            vec_env.step(next(actions))
-        return scene.horizon * n_teams
-
-    return Case(f"{backend}_vec_env", scene, "none", n_teams, work)
-
-
-def _pettingzoo(scene: Scene) -> Case:
-    from area_search import AreaSearchEnv
-
-    env = AreaSearchEnv(scene)
-    env.reset(seed=0)
-    moves = _actions((scene.n_agents,))
-    actions = [
-        dict(zip(env.possible_agents, next(moves).tolist(), strict=True)) for _ in range(101)
-    ]
-
-    def work() -> int:
-        env.reset()
-        done = 0
-        while env.agents:
-            env.step(actions[done % len(actions)])
-            done += 1
-        return done
-
-    return Case("pettingzoo", scene, "none", 1, work)
-
-
-def _reference(scene: Scene) -> Case:
-    from area_search.reference import ReferenceAreaSearch
-
-    moves = _actions((scene.n_agents,))
-    actions = [next(moves).tolist() for _ in range(101)]
-    episode = 0
-
-    def work() -> int:
-        nonlocal episode
-        team = ReferenceAreaSearch(scene, 0, episode)
-        episode += 1
-        team.observe()
-        while not team.truncated:
-            team.step(actions[team.n_steps % len(actions)])
-            team.rewards()
-            team.observe()
-        return team.n_steps
-
-    return Case("reference", scene, "none", 1, work)
-
-
 def measure_startup(repeats: int = 3) -> dict[str, Any]:
     """Measure import and compile time, each in fresh processes.
 
@@ -314,9 +113,9 @@ def measure_startup(repeats: int = 3) -> dict[str, Any]:
     times: dict[str, list[float]] = {statement: [] for statement in IMPORTS}
     for _ in range(repeats):
         for statement in IMPORTS:
-            times[statement] += _fresh_python(_IMPORT.format(statement=statement))
+            times[statement] += fresh_python(_IMPORT.format(statement=statement))
     with tempfile.TemporaryDirectory() as cache:
-        added = _fresh_python(_COMPILE.format(sub_goals=SUB_GOALS), NUMBA_CACHE_DIR=cache)
+        added = fresh_python(_COMPILE.format(sub_goals=SUB_GOALS), NUMBA_CACHE_DIR=cache)
     total = sum(added)
     return {
         "imports": {
@@ -328,21 +127,6 @@ def measure_startup(repeats: int = 3) -> dict[str, Any]:
             "total": {"seconds": total, "target": COMPILE_TARGET, "met": total < COMPILE_TARGET},
         },
     }
-
-
-def _fresh_python(code: str, **variables: str) -> list[float]:
-    # The same packages as here, however this process was told where they are.
-    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": path, **variables},
-        capture_output=True,
-        text=True,
-    )
-    if result.returncode != 0:
-        reason = result.stderr.strip().splitlines() or [f"exit code {result.returncode}"]
-        raise UsageError(f"a fresh interpreter could not run the environment: {reason[-1]}")
-    return [float(line) for line in result.stdout.split()]
 
 
 def _spread(values: Sequence[float]) -> dict[str, Any]:
@@ -389,7 +173,8 @@ def _growth(cases: dict[str, Case]) -> list[dict[str, Any]]:
     for sub_goal in SUB_GOALS:
         by_robots = [cases[case_name("native", sub_goal, n, SIDES[0])] for n in ROBOTS]
         by_side = [cases[case_name("native", sub_goal, 4, side)] for side in SIDES]
-        for along, sizes, some in (("robots", ROBOTS, by_robots), ("side", SIDES, by_side)):
+        areas = tuple(side * side for side in SIDES)
+        for along, sizes, some in (("robots", ROBOTS, by_robots), ("cells", areas, by_side)):
             costs = zip(*([1.0 / rate for rate in case.rates] for case in some), strict=True)
             exponents = [log_log_slope(sizes, cost) for cost in costs]
             growth.append(

@@ -1,0 +1,106 @@
+"""``TeamCallback``: what the callbacks of team training have in common."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from sb3_roles.common.role_wrapper import RoleWrapper
+from sb3_roles.common.team_wrapper import find_team_env
+
+Evaluate = Callable[[BaseAlgorithm], Mapping[str, float]]
+
+
+def role_wrapper_of(env: VecEnv | None) -> RoleWrapper | None:
+    """Return the ``RoleWrapper`` among the layers of an environment, if there is one."""
+    layer: Any = env
+    while isinstance(layer, VecEnvWrapper):
+        if isinstance(layer, RoleWrapper):
+            return layer
+        layer = layer.venv
+    return None
+
+
+def role_options(env: VecEnv | None) -> dict[str, Any]:
+    """Return how the roles of an environment are chosen, as arguments of ``RoleWrapper``.
+
+    :param env: a vectorized environment, or None
+    :return: ``roles``, ``role_every``, ``role_control``; empty without roles
+    """
+    wrapper = role_wrapper_of(env)
+    if wrapper is None:
+        return {}
+    names = ("roles", "role_every", "role_control")
+    return {name: getattr(wrapper, name) for name in names}
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that a reader, or an interruption, never meets half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(content)
+    os.replace(partial, path)
+
+
+def csv_bytes(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> bytes:
+    """Return a table as the bytes of a csv file."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+class TeamCallback(BaseCallback):
+    """Knows the teams below the rows; the base of the callbacks here."""
+
+    def _init_callback(self) -> None:
+        self.team_env = find_team_env(self.training_env)
+        self.n_teams, self.n_agents = self.team_env.n_teams, self.team_env.n_agents
+
+    def _begun(self) -> np.ndarray:
+        """Bool (n_teams,): which teams have not made a step in their episode yet."""
+        starts = self.model._last_episode_starts  # type: ignore[attr-defined]
+        return np.asarray(starts, np.bool_)[:: self.n_agents]
+
+    def _ended(self) -> np.ndarray:
+        """Indices of the teams whose episode has ended with this step."""
+        return np.flatnonzero(np.asarray(self.locals["dones"])[:: self.n_agents])
+
+    @property
+    def joint_steps(self) -> int:
+        """Steps of whole teams so far; SB3's ``num_timesteps`` counts those of robots."""
+        return int(self.model.num_timesteps) // self.n_agents
+
+
+def grown(array: np.ndarray, length: int) -> np.ndarray:
+    """Return an array whose second axis is long enough, with zeros in what is new."""
+    if length <= array.shape[1]:
+        return array
+    longer = np.zeros((array.shape[0], 2 * length, *array.shape[2:]), array.dtype)
+    longer[:, : array.shape[1]] = array
+    return longer
+
+
+def stacked(arrays: list[np.ndarray], fill: float) -> np.ndarray:
+    """Stack arrays of different lengths, the shorter ones filled up at their end."""
+    longest = max((len(array) for array in arrays), default=0)
+    return np.array(
+        [
+            np.pad(
+                array,
+                [(0, longest - len(array))] + [(0, 0)] * (array.ndim - 1),
+                constant_values=fill,
+            )
+            for array in arrays
+        ]
+    )

@@ -1,0 +1,162 @@
+"""What periodic evaluation measures: a function of a model that returns its scores by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from area_search.scenes import Scene, get_scene
+from sb3_roles.common.callbacks import Evaluate
+from sb3_roles.common.team_wrapper import find_team_env
+from sb3_roles.evaluation.episodes import run_episodes
+from sb3_roles.evaluation.metrics import first_above, t90
+from sb3_roles.evaluation.policies import PolicyController
+
+# Seeds of training teams have 32 bits, see ``team_seeds``: no stream from here on is one of them.
+_HELD_OUT = 2**32
+
+
+def held_out_seed(seed: int) -> int:
+    """Return the seed of a stream of area-search episodes that no training run plays.
+
+    :param seed: of the evaluation, at least 0
+    """
+    return _HELD_OUT + seed
+
+
+class SceneEvaluator:
+    """Plays held-out episodes of an area-search scene, always the same ones.
+
+    :param scene: a scene or the name of one; an early stop is switched off
+    :param n_episodes: team episodes
+    :param seed: of the held-out stream
+    :param deterministic: see :class:`~sb3_roles.evaluation.policies.PolicyController`
+    :param role_kwargs: see there; by default those of the model's environment
+    :param batch_size: teams simulated together
+    """
+
+    def __init__(
+        self,
+        scene: Scene | str,
+        n_episodes: int = 100,
+        seed: int = 0,
+        deterministic: bool = True,
+        role_kwargs: Mapping[str, Any] | None = None,
+        batch_size: int = 256,
+    ) -> None:
+        self.scene = get_scene(scene).with_options(early_stop_patience=None)
+        self.n_episodes = n_episodes
+        self.seed = seed
+        self.deterministic = deterministic
+        self.role_kwargs = role_kwargs
+        self.batch_size = batch_size
+
+    def __call__(self, model: BaseAlgorithm) -> dict[str, float]:
+        """Play the episodes.
+
+        :param model: any SB3 model
+        :return: ``explo_paper``, ``explo_true``, ``cover`` (mean fractions), ``t90_share``,
+            ``n_episodes`` and, where they exist, ``time_e_paper`` and ``t90_true``
+        """
+        controller = PolicyController(model, self.role_kwargs, self.deterministic)
+        records = run_episodes(
+            controller,
+            self.scene,
+            self.n_episodes,
+            held_out_seed(self.seed),
+            batch_size=self.batch_size,
+        )
+        scores = {name: float(curve[:, -1].mean()) for name, curve in records.curves.items()}
+        mean_curve = records.curves["explo_paper"].mean(axis=0, keepdims=True)
+        time = int(first_above(mean_curve)[0])
+        if time < self.scene.horizon:
+            scores["time_e_paper"] = float(time)
+        mean, _, share = t90(records.t90_true)
+        if mean is not None:
+            scores["t90_true"] = mean
+        return {**scores, "t90_share": share, "n_episodes": float(self.n_episodes)}
+
+
+class VecEnvEvaluator:
+    """Plays team episodes of any environment, always the same ones.
+
+    Each team plays an equal share of the episodes, so that short episodes are not preferred.
+
+    :param env: a vectorized environment of its own (not the one that is trained on), wrapped as
+        that one is
+    :param n_episodes: team episodes
+    :param seed: of the environment; streams of training seeds differ from it
+    :param deterministic: handed to ``predict``
+    """
+
+    def __init__(
+        self, env: VecEnv, n_episodes: int = 20, seed: int = 0, deterministic: bool = True
+    ) -> None:
+        self.env = env
+        self.team_env = find_team_env(env)
+        self.n_episodes = n_episodes
+        self.seed = seed
+        self.deterministic = deterministic
+
+    def __call__(self, model: BaseAlgorithm) -> dict[str, float]:
+        """Play the episodes.
+
+        :param model: any SB3 model
+        :return: ``return`` (sum over the robots of a team), ``length``, the numbers in the
+            environment's ``episode_metrics``, and ``n_episodes``; means
+        """
+        teams, agents = self.team_env.n_teams, self.team_env.n_agents
+        # VecEnv.reset() takes the seeds once: the next evaluation plays the same episodes.
+        self.env.seed(held_out_seed(self.seed))
+        observations: Any = self.env.reset()
+        left = (self.n_episodes + np.arange(teams)) // teams
+        returns, length = np.zeros(teams), np.zeros(teams, np.int64)
+        episodes: list[dict[str, float]] = []
+        state, starts = None, np.ones(teams * agents, np.bool_)
+        while left.any():
+            actions, state = model.predict(observations, state, starts, self.deterministic)
+            observations, rewards, starts, infos = self.env.step(actions)
+            returns += np.asarray(rewards).reshape(teams, agents).sum(axis=1)
+            length += 1
+            for team in np.flatnonzero(starts[::agents]):
+                if left[team] > 0:
+                    left[team] -= 1
+                    metrics = infos[team * agents].get("episode_metrics", {})
+                    episodes.append(
+                        {"return": float(returns[team]), "length": float(length[team]), **metrics}
+                    )
+                returns[team], length[team] = 0.0, 0
+        names = dict.fromkeys(name for episode in episodes for name in episode)
+        scores = {
+            name: float(np.mean([episode[name] for episode in episodes if name in episode]))
+            for name in names
+        }
+        return {**scores, "n_episodes": float(len(episodes))}
+
+
+def make_evaluator(
+    model: BaseAlgorithm, n_episodes: int = 100, seed: int = 0, deterministic: bool = True
+) -> Evaluate:
+    """Make the evaluation of a model on the task that it is trained on.
+
+    :param model: a model with an area-search environment
+    :param n_episodes: team episodes
+    :param seed: of the held-out stream
+    :param deterministic: take the likeliest actions
+    :return: a :class:`SceneEvaluator`
+    :raises ValueError: if the environment is another one
+    """
+    try:
+        scene = find_team_env(model.env).get_attr("scene", [0])[0]
+    except AttributeError:
+        scene = None
+    if not isinstance(scene, Scene):
+        raise ValueError(
+            "the environment is not area search: evaluate on a second one, with "
+            "EvaluationCallback(evaluate=VecEnvEvaluator(env))"
+        )
+    return SceneEvaluator(scene, n_episodes, seed, deterministic)

@@ -1,0 +1,62 @@
+"""What a measurement runs on, and measurements in fresh processes."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+from typing import Any
+
+from sb3_roles._version import __version__
+from sb3_roles.zoo.options import UsageError
+
+
+def describe_machine() -> dict[str, Any]:
+    """Describe what the measurement runs on; call it before the work, for the load average.
+
+    :return: CPU, cores, load average of the last minute, versions
+    """
+    cpu = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [
+                line.split(":", 1)[1].strip() for line in file if line.startswith("model name")
+            ]
+        cpu = names[0] if names else cpu
+    except OSError:
+        pass  # not Linux
+    affinity = getattr(os, "sched_getaffinity", None)
+    return {
+        "cpu": cpu,
+        "cores": os.cpu_count(),
+        "usable_cores": len(affinity(0)) if affinity else os.cpu_count(),
+        "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
+        "sb3_roles": __version__,
+    }
+
+
+def fresh_python(code: str, **variables: str) -> list[float]:
+    """Run code in a new interpreter.
+
+    :param code: prints numbers
+    :param variables: environment variables to set
+    :return: the printed numbers
+    :raises UsageError: if it fails
+    """
+    # The same packages as here, however this process was told where they are.
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": path, **variables},
+        capture_output=True,
+        text=True,
+    )
+    if result.returncode != 0:
+        reason = result.stderr.strip().splitlines() or [f"exit code {result.returncode}"]
+        raise UsageError(f"a fresh interpreter could not run the environment: {reason[-1]}")
+    return [float(line) for line in result.stdout.split()]
