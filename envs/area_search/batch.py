@@ -149,6 +149,7 @@ class BatchedAreaSearch:
         if self.sub_goal != "none":
             shape = self.observation_space["sub_goal"].shape or ()
             self.observations["sub_goal"] = np.zeros((m, n, *shape), np.float32)
+        self.first_team = {key: value[0] for key, value in self.observations.items()}
         self.metrics = {name: self.metric_values[:, k] for k, name in enumerate(kernels.METRICS)}
         self._bind_kernels()
 

@@ -163,8 +163,9 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         terminations = dict.fromkeys(agents, terminated)
         truncations = dict.fromkeys(agents, truncated)
         if terminated or truncated:
+            final = batch.episode_metrics(0)
             for info in infos.values():
-                info["episode_metrics"] = batch.episode_metrics(0)
+                info["episode_metrics"] = final.copy()
             self.agents = []
         if self.render_mode == "human":
             self.render()
@@ -193,7 +194,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
     def _observations(self) -> ObsDict:
         # One copy of each array for the whole team: observations stay valid for ever, and the
         # team's maps are shared by its robots. Order "K" keeps the channels last in memory.
-        arrays = {key: value[0].copy("K") for key, value in self._batch.observations.items()}
+        arrays = {key: value.copy("K") for key, value in self._batch.first_team.items()}
         own = [(key, array) for key, array in arrays.items() if key not in _TEAM_KEYS]
         team = {}
         for i, agent in enumerate(self.possible_agents):

@@ -264,7 +264,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         last = last_values.detach().view(-1, 1)
         self.compute_stream_returns(last, gamma, gae_lambda, normalize_advantage=False)
 
-    def get(self, batch_size: int | None = None) -> Generator[DictRolloutBufferSamples, None, None]:
+    def get(  # type: ignore[override]
+        self, batch_size: int | None = None
+    ) -> Generator[DictRolloutBufferSamples, None, None]:
         """Go once through the rollout.
 
         :param batch_size: rows per minibatch, rounded down to whole teams; None for all
@@ -273,7 +275,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         teams = None if batch_size is None else max(1, batch_size // self.n_agents)
         for index in self._index(teams):
             yield DictRolloutBufferSamples(
-                observations=self._observations_at(index),  # type: ignore[arg-type]
+                observations=self._observations_at(index),
                 actions=self._take(self._actions, index),
                 old_values=self._take(self._values, index).flatten(),
                 old_log_prob=self._take(self._joint_log_prob, index),
@@ -290,13 +292,13 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         return arrays[0].cpu().numpy(), arrays[1].cpu().numpy()
 
     # DictRolloutBuffer has these as attributes, which stock algorithms read.
-    @property  # type: ignore[override]
-    def values(self) -> Any:
+    @property
+    def values(self) -> Any:  # type: ignore[override]
         """Values of the first stream, float32 (T, n)."""
         return self._first_stream(self._values)
 
-    @property  # type: ignore[override]
-    def returns(self) -> Any:
+    @property
+    def returns(self) -> Any:  # type: ignore[override]
         """Returns of the first stream, float32 (T, n)."""
         return self._first_stream(self._returns)
 

@@ -1,4 +1,4 @@
-"""``EvaluationCallback``: periodic evaluation on held-out episodes, and the best policy's weights."""
+"""``EvaluationCallback``: evaluation on held-out episodes, and the best policy's weights."""
 
 from __future__ import annotations
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numba import njit
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
@@ -46,7 +48,7 @@ class PolicyController:
         model's environment, if it has one
     :param deterministic: take the likeliest role and move instead of drawing them
     :param communicate: False switches the messages between robots off
-    :raises ValueError: if an option is unknown, or the policy cannot act without ``state``
+    :raises ValueError: if an option is unknown
     """
 
     uses_observation: ClassVar[bool] = False
@@ -68,11 +70,6 @@ class PolicyController:
         self.is_team_policy = isinstance(self.policy, TeamPolicy)
         space = self.policy.observation_space
         known = space.spaces if isinstance(space, spaces.Dict) else {}
-        if STATE_KEY in known and not self.is_team_policy:
-            raise ValueError(
-                f"{type(self.policy).__name__} was trained with 'state', which robots do not know: "
-                "only the actors of team policies act without it"
-            )
         extra = (AGENT_KEY, ROLE_KEY, ROLE_DUE_KEY, STATE_KEY)
         self.keys = tuple(key for key in known if key not in extra)
         if isinstance(self.policy, TeamPolicy):
@@ -184,16 +181,7 @@ class PolicyController:
         if isinstance(self.policy, TeamPolicy):
             roles, moves = self._choose_for_teams(self.policy, rows, uniforms)
         else:
-            known = self.policy.observation_space
-            is_dict = isinstance(known, spaces.Dict)
-            actions, self._state = self.policy.predict(
-                {k: rows[k] for k in known.spaces} if is_dict else rows["observation"],  # type: ignore[attr-defined]
-                self._state,
-                np.full(len(self._members), self._steps == 0),
-                self.deterministic,
-            )
-            actions = actions.reshape(len(self._members), -1)
-            roles, moves = actions[:, 0], actions[:, -1]
+            roles, moves = self._choose_for_rows(rows)
         self._steps += 1
         if self.roles is not None:
             self._current = np.asarray(roles, np.int64)
@@ -211,6 +199,45 @@ class PolicyController:
             ROLE_KEY: (self._current[:, None] == np.arange(self.n_roles)).astype(np.float32),
             ROLE_DUE_KEY: np.full((len(self._current), 1), decides, np.float32),
         }
+
+    def _choose_for_rows(self, rows: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Ask a policy of single robots, such as those of RecurrentPPO and MaskablePPO."""
+        space, n_rows = self.policy.observation_space, len(self._members)
+        known = space.spaces if isinstance(space, spaces.Dict) else None
+        options: dict[str, Any] = {}
+        if isinstance(self.policy, MaskableActorCriticPolicy):
+            options["action_masks"] = self._masks(rows)
+        try:
+            actions, self._state = self.policy.predict(
+                rows["observation"]  # type: ignore[arg-type]
+                if known is None
+                else {key: rows[key] for key in known if key in rows},
+                self._state,
+                np.full(n_rows, self._steps == 0),
+                self.deterministic,
+                **options,
+            )
+        except KeyError as error:
+            raise ValueError(
+                f"{type(self.policy).__name__} reads {error}, which robots do not know: policies "
+                "must act on what a robot observes"
+            ) from error
+        actions = actions.reshape(n_rows, -1)
+        return actions[:, 0], actions[:, -1]
+
+    def _masks(self, rows: dict[str, np.ndarray]) -> np.ndarray:
+        """As ``MaskWrapper``: a role that goes on, and no blocked moves in area search."""
+        parts = []
+        if self.n_roles:
+            parts.append((rows[ROLE_DUE_KEY] > 0.5) | (rows[ROLE_KEY] > 0.5))
+        if self.batch is not None:
+            # By name: evaluation does not depend on the command line.
+            parts.append(import_module("sb3_roles.zoo.row_policies").open_moves(rows["local"]))
+        else:
+            space = self.policy.action_space
+            n = int(space.nvec[-1] if self.n_roles else space.n)  # type: ignore[attr-defined]
+            parts.append(np.ones((len(self._members), n), np.bool_))
+        return np.concatenate(parts, axis=1)
 
     def _choose_for_teams(
         self, policy: TeamPolicy, rows: dict[str, np.ndarray], uniforms: np.ndarray

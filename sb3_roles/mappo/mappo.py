@@ -189,7 +189,7 @@ class MAPPO(OnPolicyAlgorithm):
     def _to_env(self, actions: np.ndarray) -> np.ndarray:
         return actions[:, 0]
 
-    def collect_rollouts(  # type: ignore[override]
+    def collect_rollouts(
         self,
         env: VecEnv,
         callback: BaseCallback,

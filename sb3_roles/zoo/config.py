@@ -14,7 +14,7 @@ from typing import Any
 from sb3_roles.common.names import closest
 from sb3_roles.common.roles import ROLES
 from sb3_roles.zoo.algorithms import ALGORITHMS, POLICY_ARGUMENTS, Algorithm
-from sb3_roles.zoo.environments import AREA_SEARCH, env_problems
+from sb3_roles.zoo.environments import AREA_SEARCH, REWARD_COMPONENTS, env_problems
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ranges import Choice, Items, Range, Weights, Whole, problems
 
@@ -176,7 +176,8 @@ def config_problems(config: Mapping[str, Any]) -> list[str]:
     }
     nested = {key: config[key] for key in NESTED if key in config}
     flat = {key: config[key] for key in config if key not in (*nested, "algo", "env")}
-    found = _hint_nested(problems("", flat, {**top, **dict.fromkeys(NESTED, Weights())}))
+    # The nested keys are here for the closest match of a mistyped one.
+    found = problems("", flat, {**top, **dict.fromkeys(NESTED, Weights())})
     for key, value in nested.items():
         if not isinstance(value, Mapping):
             found.append(f"{key} must be keys and values, got {value!r}")
@@ -188,10 +189,6 @@ def config_problems(config: Mapping[str, Any]) -> list[str]:
     if isinstance(config.get("policy_kwargs"), Mapping) and policy in POLICY_ARGUMENTS:
         found += problems("policy_kwargs", config["policy_kwargs"], POLICY_ARGUMENTS[policy])
     return found or _together(config)
-
-
-def _hint_nested(lines: list[str]) -> list[str]:
-    return lines
 
 
 def _wrapper_problems(algorithm: Algorithm, env: str, options: Mapping[str, Any]) -> list[str]:
@@ -226,8 +223,6 @@ def _wrapper_problems(algorithm: Algorithm, env: str, options: Mapping[str, Any]
 
 
 def _component_problems(options: Mapping[str, Any]) -> list[str]:
-    from area_search.rewards import REWARD_COMPONENTS
-
     tables = {"role_weights": options.get("role_weights") or {}}
     matrix = options.get("primitive_weights")
     if isinstance(matrix, Mapping):

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 AREA_SEARCH = "area-search-v0"
 ENVIRONMENTS: dict[str, str] = {AREA_SEARCH: "area_search:AreaSearchEnv"}
-# area_search.paths has the list, and takes numba a second to import.
+# area_search has both lists, behind numba, which takes a second to import.
 SUB_GOALS = ("none", "nearest", "assigned")
+REWARD_COMPONENTS = ("explore", "cover")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
@@ -46,7 +47,7 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
     for key in options:
         if key not in known:
             names = ["scene", "sub_goal", *known]
-            found.append(closest("key env_kwargs.", key, names).replace(". '", ".'", 1))
+            found.append(closest("key in env_kwargs", key, names))
     single = []
     for key, value in options.items():
         if key in known:

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from sb3_roles.common.names import closest
+
 _TEXT_NUMBER = re.compile(r"([+-]?[0-9_]*\.?[0-9]*)[eE]([+-]?)([0-9]+)")
 LINEAR = "lin_"
 
@@ -125,8 +127,6 @@ class Choice:
 
     def problem(self, value: Any) -> str | None:
         """See :class:`Range`."""
-        from sb3_roles.common.names import closest
-
         if self.matrix and isinstance(value, Mapping):
             for role, weights in value.items():
                 problem = Weights().problem(weights)
@@ -207,15 +207,13 @@ def problems(where: str, values: Any, allowed: Mapping[str, Range]) -> list[str]
     :param allowed: known keys, and what their values may be
     :return: one line per problem
     """
-    from sb3_roles.common.names import closest
-
     prefix = f"{where}." if where else ""
     if not isinstance(values, Mapping):
         return [f"{where or 'the configuration'} must be a mapping of keys, got {values!r}"]
     found = []
     for key, value in values.items():
         if key not in allowed:
-            found.append(closest(f"key {prefix}" if where else "key", key, allowed))
+            found.append(closest(f"key in {where}" if where else "key", key, allowed))
             continue
         problem = allowed[key].problem(value)
         if problem is not None:

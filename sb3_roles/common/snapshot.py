@@ -1,0 +1,316 @@
+"""Everything that the future of a training run depends on, taken from a model and put back.
+
+A snapshot is taken between iterations, when the last update is done and the next rollout has not
+begun: the rollout buffer is empty then. Training that goes on from it ends in the same weights,
+optimizer, logs and environments as training that was never stopped.
+"""
+
+from __future__ import annotations
+
+import platform
+import random
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import stable_baselines3
+import torch as th
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from sb3_roles._version import __version__
+from sb3_roles.common.checkpoint import Checkpoint, CheckpointError
+from sb3_roles.common.native_vec_env import NativeTeamVecEnv
+from sb3_roles.common.team_wrapper import find_team_env
+
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
+
+
+def machine_facts(device: th.device) -> dict[str, Any]:
+    """Return what bit-exactness depends on beyond a run's own state."""
+    facts = {
+        "sb3_roles": __version__,
+        "torch": th.__version__,
+        "numpy": np.__version__,
+        "stable_baselines3": stable_baselines3.__version__,
+        "python": platform.python_version(),
+        "device": device.type,
+        "threads": th.get_num_threads(),
+        "cpu_capability": th.backends.cpu.get_cpu_capability(),
+        "dtype": str(th.get_default_dtype()),
+    }
+    if device.type == "cuda":
+        facts["gpu"] = th.cuda.get_device_name(device)
+    return facts
+
+
+def differences(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return what keeps a run on another machine from being bit-exact, one text each."""
+    return [
+        f"{name} was {saved.get(name)}, is {now.get(name)}"
+        for name in {**saved, **now}
+        if saved.get(name) != now.get(name)
+    ]
+
+
+# Environments
+
+
+def _wrappers(env: VecEnv) -> Iterator[VecEnvWrapper]:
+    layer: Any = env
+    while isinstance(layer, VecEnvWrapper):
+        yield layer
+        layer = layer.venv
+
+
+def _team_rows(env: VecEnv) -> list[int]:
+    """One row for each environment below: the native backend has one for all teams."""
+    team_env = find_team_env(env)
+    native = isinstance(team_env, NativeTeamVecEnv)
+    return [0] if native else list(range(0, team_env.num_envs, team_env.n_agents))
+
+
+def env_gap(env: VecEnv) -> str | None:
+    """Return why an environment can not be continued bit for bit; None if it can."""
+    team_env = find_team_env(env)
+    for method in ("get_state", "set_state"):
+        try:
+            owners = team_env.get_attr(method, indices=0)
+        except AttributeError:
+            owners = [None]
+        if not callable(owners[0]):
+            layers = team_env.get_attr("metadata", indices=0)[0] or {}
+            return f"environment {layers.get('name', 'of this run')} offers no {method}"
+    return None
+
+
+def _env_state(env: VecEnv) -> dict[str, Any]:
+    gap = env_gap(env)
+    team_env = find_team_env(env)
+    teams = None
+    if gap is None:
+        teams = [team_env.env_method("get_state", indices=row)[0] for row in _team_rows(env)]
+    layers = [layer.get_state() for layer in _wrappers(env) if hasattr(layer, "get_state")]
+    return {"teams": teams, "wrappers": layers}
+
+
+def _set_env_state(env: VecEnv, state: Mapping[str, Any]) -> None:
+    team_env, rows = find_team_env(env), _team_rows(env)
+    if state["teams"] is not None:
+        if len(state["teams"]) != len(rows):
+            raise CheckpointError("the environments' state is of another number of teams")
+        for row, one in zip(rows, state["teams"], strict=True):
+            team_env.env_method("set_state", one, indices=row)
+    layers = [layer for layer in _wrappers(env) if hasattr(layer, "set_state")]
+    for layer, one in zip(layers, state["wrappers"], strict=True):
+        layer.set_state(one)
+
+
+# Random numbers
+
+
+def rng_state() -> dict[str, Any]:
+    """Return the global generators of torch, numpy and python."""
+    name, keys, position, has_gauss, gauss = np.random.get_state()  # noqa: NPY002
+    version, internal, gauss_next = random.getstate()
+    cuda = th.cuda.get_rng_state_all() if th.cuda.is_available() else []
+    return {
+        "torch": th.get_rng_state().numpy(),
+        "cuda": [one.numpy() for one in cuda],
+        "numpy": [str(name), keys, int(position), int(has_gauss), float(gauss)],
+        "python": [version, np.array(internal, np.uint64), gauss_next],
+    }
+
+
+def set_rng_state(state: Mapping[str, Any]) -> None:
+    """Set the global generators of torch, numpy and python."""
+    th.set_rng_state(th.from_numpy(np.array(state["torch"])))
+    if state["cuda"] and th.cuda.device_count() == len(state["cuda"]):
+        th.cuda.set_rng_state_all([th.from_numpy(np.array(one)) for one in state["cuda"]])
+    name, keys, position, has_gauss, gauss = state["numpy"]
+    np.random.set_state((name, keys, position, has_gauss, gauss))  # noqa: NPY002
+    version, internal, gauss_next = state["python"]
+    random.setstate((version, tuple(int(word) for word in internal), gauss_next))
+
+
+# The model
+
+
+def _optimizer_tensors(model: OnPolicyAlgorithm) -> dict[str, th.Tensor]:
+    return {
+        f"{index}.{name}": th.as_tensor(value)
+        for index, entries in model.policy.optimizer.state_dict()["state"].items()
+        for name, value in entries.items()
+    }
+
+
+def capture(model: OnPolicyAlgorithm, stateful: Sequence[Any] = ()) -> dict[str, Any]:
+    """Take a snapshot between two iterations.
+
+    :param model: the algorithm, with its environment
+    :param stateful: callbacks and writers with ``get_state()``
+    :return: ``policy``, ``optimizer`` and ``state`` of ``write_checkpoint``
+    """
+    assert model.env is not None
+    logger = model.logger
+    last_obs: Any = model._last_obs
+    lstm = getattr(model, "_last_lstm_states", None)
+    values = {
+        key: value.item() if isinstance(value, np.generic) else value
+        for key, value in logger.name_to_value.items()
+        if isinstance(value, (bool, int, float, str, np.generic))
+    }
+    state = {
+        "counters": {name: getattr(model, name) for name in _COUNTERS},
+        "elapsed_ns": time.time_ns() - model.start_time,
+        "kl_coefs": list(getattr(model, "kl_coefs", [])),
+        "optimizer_rates": [group["lr"] for group in model.policy.optimizer.param_groups],
+        "env": _env_state(model.env),
+        "last_obs": dict(last_obs) if isinstance(last_obs, dict) else {"": last_obs},
+        "last_episode_starts": np.asarray(model._last_episode_starts),
+        "lstm": None if lstm is None else [[t.cpu().numpy() for t in pair] for pair in lstm],
+        "ep_info": list(model.ep_info_buffer or ()),
+        "ep_success": list(model.ep_success_buffer or ()),
+        "logger": {
+            "values": values,
+            "counts": {key: logger.name_to_count[key] for key in values},
+            "excluded": {key: logger.name_to_excluded.get(key, ()) for key in values},
+        },
+        "stateful": [[type(one).__name__, one.get_state()] for one in stateful],
+        "rng": rng_state(),
+    }
+    return {
+        "policy": model.policy.state_dict(),
+        "optimizer": _optimizer_tensors(model),
+        "state": state,
+    }
+
+
+def load_weights(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
+    """Put weights and buffers into a policy that was built from the configuration.
+
+    :param model: the algorithm
+    :param checkpoint: read from a file
+    :raises CheckpointError: if a name, shape or dtype is another one; nothing is changed then
+    """
+    own = model.policy.state_dict()
+    odd = sorted(set(own) ^ set(checkpoint.policy))
+    if odd:
+        raise CheckpointError(f"the weights do not fit the configuration: {odd[0]} is in one only")
+    for name, tensor in own.items():
+        _check_like(f"weights {name}", checkpoint.policy[name], tensor)
+    model.policy.load_state_dict(checkpoint.policy)
+
+
+def _check_like(what: str, given: th.Tensor, wanted: th.Tensor) -> None:
+    if given.shape != wanted.shape or given.dtype != wanted.dtype:
+        raise CheckpointError(
+            f"the {what} do not fit the configuration: {given.dtype} {tuple(given.shape)}, "
+            f"expected {wanted.dtype} {tuple(wanted.shape)}"
+        )
+
+
+def _load_optimizer(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
+    optimizer = model.policy.optimizer
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    entries: dict[int, dict[str, th.Tensor]] = {}
+    for key, tensor in checkpoint.optimizer.items():
+        index, _, name = key.partition(".")
+        if not index.isdigit() or int(index) >= len(parameters):
+            raise CheckpointError(f"the optimizer does not fit the configuration: {key}")
+        parameter = parameters[int(index)]
+        if tensor.ndim == 0:
+            entries.setdefault(int(index), {})[name] = tensor
+            continue
+        _check_like(f"optimizer's {key}", tensor, parameter)
+        # Laid out like the parameter, as the optimizer itself would: fused kernels rely on it.
+        like = th.empty_like(parameter, requires_grad=False)
+        entries.setdefault(int(index), {})[name] = like.copy_(tensor)
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": entries})
+
+
+def restore(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
+    """Put a snapshot back, except for generators and callbacks.
+
+    :param model: built from the same configuration, its ``_setup_learn`` done: the environment is
+        reset and the logger exists
+    :param checkpoint: read from a file
+    :raises CheckpointError: if it does not fit
+    """
+    assert model.env is not None
+    state = checkpoint.state
+    try:
+        load_weights(model, checkpoint)
+        _load_optimizer(model, checkpoint)
+        for group, rate in zip(
+            model.policy.optimizer.param_groups, state["optimizer_rates"], strict=True
+        ):
+            group["lr"] = rate
+        for name in _COUNTERS:
+            setattr(model, name, state["counters"][name])
+        model.start_time = time.time_ns() - int(state["elapsed_ns"])
+        if state["kl_coefs"]:
+            model.kl_coefs = [float(one) for one in state["kl_coefs"]]  # type: ignore[attr-defined]
+        _set_env_state(model.env, state["env"])
+        if state["env"]["teams"] is not None:
+            _set_observations(model, state)
+        if state["lstm"] is not None:
+            _set_lstm(model, state["lstm"])
+        window = model._stats_window_size
+        model.ep_info_buffer = deque(state["ep_info"], maxlen=window)
+        model.ep_success_buffer = deque(state["ep_success"], maxlen=window)
+        logger = state["logger"]
+        for key, value in logger["values"].items():
+            model.logger.name_to_value[key] = value
+            model.logger.name_to_count[key] = logger["counts"][key]
+            model.logger.name_to_excluded[key] = tuple(logger["excluded"][key])
+    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"the checkpoint does not fit the configuration: {error}") from error
+
+
+def _set_observations(model: OnPolicyAlgorithm, state: Mapping[str, Any]) -> None:
+    fresh: Any = model._last_obs
+    is_dict = isinstance(fresh, dict)
+    templates = fresh if is_dict else {"": fresh}
+    saved = state["last_obs"]
+    if set(saved) != set(templates):
+        raise CheckpointError("the last observation has other keys than the environment's")
+    restored = {}
+    for key, template in templates.items():
+        if saved[key].shape != template.shape or saved[key].dtype != template.dtype:
+            raise CheckpointError(f"the last observation {key!r} has another shape or dtype")
+        # Laid out like the environment's: convolutions choose their kernel by it.
+        restored[key] = np.empty_like(template)
+        np.copyto(restored[key], saved[key])
+    model._last_obs = restored if is_dict else restored[""]  # type: ignore[assignment]
+    model._last_episode_starts = np.array(state["last_episode_starts"])
+
+
+def _set_lstm(model: Any, saved: Sequence[Sequence[np.ndarray]]) -> None:
+    fresh = model._last_lstm_states
+    pairs = []
+    for pair, old in zip(saved, fresh, strict=True):
+        tensors = [th.from_numpy(np.array(one)).to(model.device) for one in pair]
+        for given, wanted in zip(tensors, old, strict=True):
+            _check_like("LSTM states", given, wanted)
+        pairs.append(tuple(tensors))
+    model._last_lstm_states = type(fresh)(*pairs)
+
+
+def restore_stateful(stateful: Sequence[Any], checkpoint: Checkpoint) -> None:
+    """Put the state of callbacks and writers back.
+
+    :param stateful: as given to :func:`capture`, in that order
+    :param checkpoint: read from a file
+    :raises CheckpointError: if these are others
+    """
+    saved = checkpoint.state["stateful"]
+    names = [type(one).__name__ for one in stateful]
+    if [name for name, _ in saved] != names:
+        raise CheckpointError(f"the run had the callbacks {[n for n, _ in saved]}, now {names}")
+    for one, (_, state) in zip(stateful, saved, strict=True):
+        one.set_state(state)
