@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from area_search import AreaSearchEnv, BatchedAreaSearch
 
+from area_search import AreaSearchEnv, BatchedAreaSearch
 from sb3_roles.common.team_vec_env import make_team_vec_env, team_seeds
 
 OPTIONS: dict[str, Any] = {"height": 9, "width": 11, "n_targets": 20, "n_agents": 3, "horizon": 12}

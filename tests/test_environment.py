@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import pickle
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -888,3 +889,24 @@ def test_scenes_are_not_changed_by_playing() -> None:
         batch.step(np.ones((1, 4), int))
         assert batch.scene is SCENES[name]
     assert before == SCENES
+
+
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned"])
+def test_steps_allocate_nothing(sub_goal: str) -> None:
+    """Arrays stay where they are, and the traced memory does not depend on the maps' size."""
+    batch = BatchedAreaSearch("hard", 64, sub_goal)
+    batch.reset(0)
+    actions = np.random.default_rng(0).integers(0, 5, (20, 64, batch.n_agents))
+    before = {key: array.ctypes.data for key, array in batch.observations.items()}
+    for moves in actions:
+        batch.step(moves)
+    tracemalloc.start()
+    try:
+        for moves in actions:
+            batch.step(moves)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # A single map of one team has 625 cells; the batch has 64 teams and four kinds of maps.
+    assert peak < 8 * 625
+    assert {key: array.ctypes.data for key, array in batch.observations.items()} == before
