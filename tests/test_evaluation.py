@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch as th
 
-from area_search import BatchedAreaSearch, get_scene
+from area_search import AreaSearchEnv, BatchedAreaSearch, get_scene
+from sb3_roles import HMAPPO, MAPPO, RoleWrapper, TeamWrapper, make_team_vec_env
 from sb3_roles.baselines import CONTROLLER_NAMES, CONTROLLERS, controller_class
 from sb3_roles.baselines.random import RandomController
-from sb3_roles.evaluation.episodes import EpisodeRecords, run_episodes
+from sb3_roles.common.team_vec_env import team_seeds
+from sb3_roles.evaluation.episodes import EpisodeRecords, Player, run_episodes
+from sb3_roles.evaluation.evaluators import SceneEvaluator, held_out_seed
 from sb3_roles.evaluation.metrics import mean_and_error, summarize, t90, time_e_paper
+from sb3_roles.evaluation.policies import PolicyController
 
 PLAIN = get_scene("hard", horizon=12)
 STOPPING = get_scene("hard", horizon=40, early_stop_patience=6)
@@ -207,3 +212,139 @@ def test_summary_is_in_percent_and_steps():
     assert summary["cover"]["se"] == pytest.approx(10.0)
     assert summary["t90_true"] == {"mean": 1.0, "se": None, "unit": "steps", "share": 0.5}
     assert summary["time_e_paper"] == {"mean": None, "se": None, "unit": "steps"}
+
+
+SMALL = {
+    "local_channels": [4] * 3,
+    "joint_channels": [4] * 4,
+    "state_channels": [4] * 3,
+    "graph_width": 8,
+}
+TINY = get_scene("hard", height=9, width=9, n_targets=10, horizon=8, n_agents=3)
+
+
+def tiny_policy(sub_goal="assigned", algo=HMAPPO, scene=TINY, **wrapper):
+    """An untrained policy, with outputs large enough to tell one observation from another."""
+    venv = make_team_vec_env(lambda: AreaSearchEnv(scene, sub_goal=sub_goal), 2, seed=0)
+    options = {"policy_kwargs": SMALL, "n_steps": 2, "batch_size": 4, "device": "cpu", "seed": 1}
+    if algo is MAPPO:
+        return MAPPO("TeamPolicy", TeamWrapper(venv), **options)
+    model = HMAPPO("RolePolicy", RoleWrapper(venv, **wrapper), **options)
+    for name in ("role_net", "action_net"):
+        for parameter in getattr(model.policy, name).out.parameters():
+            parameter.data *= 100
+    return model
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("algo", [HMAPPO, MAPPO])
+def test_a_policy_plays_the_same_in_any_batch(algo, deterministic):
+    controller = PolicyController(tiny_policy(algo=algo), deterministic=deterministic)
+    before = th.get_rng_state()
+    whole = run_episodes(controller, TINY, 30, seed=3)
+    for batch_size in (1, 7):
+        again = run_episodes(controller, TINY, 30, seed=3, batch_size=batch_size)
+        assert_same(whole, again)
+        assert np.array_equal(whole.roles, again.roles)
+    assert th.equal(before, th.get_rng_state())
+    assert set(np.unique(whole.roles)) == ({0, 1} if algo is HMAPPO else {-1})
+
+
+def test_a_policy_acts_as_in_its_training_environment():
+    model = tiny_policy(role_every=3)
+    controller = PolicyController(model)
+    batch = BatchedAreaSearch(TINY, 2, "assigned")
+    env = model.env
+    env.seed(11)
+    obs = env.reset()
+    batch.reset([int(s) for s in team_seeds(11, 2)])
+    player = Player(controller, batch)
+    for _ in range(TINY.horizon - 1):
+        actions, _ = model.predict(obs, deterministic=True)
+        obs, *_ = env.step(actions)
+        player.step()
+        assert np.array_equal(player.roles.ravel(), actions[:, 0])
+        assert np.array_equal(obs["position"], batch.position.reshape(-1, 2))
+
+
+@pytest.mark.parametrize("n_agents", [1, 2, 15, 50])
+def test_one_policy_serves_teams_and_maps_of_any_size(n_agents):
+    controller = PolicyController(tiny_policy())
+    for side in (9, 14):
+        scene = TINY.with_options(n_agents=n_agents, height=side, width=side + 2)
+        records = run_episodes(controller, scene, 3, seed=0)
+        assert records.roles.shape == (3, TINY.horizon, n_agents)
+        assert records.roles.min() >= 0
+        assert records.curves["explo_true"][:, -1].min() > 0
+
+
+def test_no_action_depends_on_the_state():
+    controller = PolicyController(tiny_policy())
+    whole = run_episodes(controller, TINY, 10, seed=0)
+    assert "state" not in controller.keys
+
+    class Blinded(PolicyController):
+        def begin(self, batch):
+            super().begin(batch)
+            del batch.observations["state"]
+
+    assert_same(whole, run_episodes(Blinded(tiny_policy()), TINY, 10, seed=0))
+
+
+@pytest.mark.parametrize("name", ["explore", "cover"])
+def test_a_controlled_role_is_recorded_until_the_end(name):
+    model = tiny_policy()
+    controller = PolicyController(model.policy, {"role_control": name})
+    scene = TINY.with_options(horizon=30, early_stop_patience=4)
+    records = run_episodes(controller, scene, 20, seed=0)
+    assert records.length.min() < 30
+    for row, length in enumerate(records.length):
+        assert np.all(records.roles[row, :length] == ["explore", "cover"].index(name))
+        assert np.all(records.roles[row, length:] == -1)
+
+
+@pytest.mark.parametrize("control", ["learned", "random"])
+def test_roles_last_as_long_as_they_were_trained_to(control):
+    controller = PolicyController(tiny_policy(role_every=4, role_control=control))
+    assert controller.role_every == 4
+    roles = run_episodes(controller, TINY, 40, seed=0).roles
+    switches = (roles[:, 1:] != roles[:, :-1]).any(axis=(0, 2))
+    assert np.flatnonzero(switches).tolist() == [3]
+    if control == "random":
+        assert abs(roles.mean() - 0.5) < 0.15
+
+
+def test_messages_can_be_switched_off():
+    model = tiny_policy()
+    whole = run_episodes(PolicyController(model), TINY, 30, seed=0)
+    silent = run_episodes(PolicyController(model, communicate=False), TINY, 30, seed=0)
+    assert not np.array_equal(whole.roles, silent.roles)
+    assert model.policy.communicate
+
+
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned"])
+def test_the_sub_goal_is_that_of_the_training(sub_goal):
+    controller = PolicyController(tiny_policy(sub_goal))
+    assert controller.sub_goal == sub_goal
+    run_episodes(controller, TINY, 2, seed=0)
+    if sub_goal != "none":
+        with pytest.raises(ValueError, match=f"this policy needs '{sub_goal}'"):
+            run_episodes(controller, TINY, 2, seed=0, sub_goal="none")
+
+
+def test_wrong_roles_are_refused():
+    policy = tiny_policy().policy
+    with pytest.raises(ValueError, match="did you mean 'cover'"):
+        PolicyController(policy, {"role_control": "covr"})
+    with pytest.raises(ValueError, match="has 2 roles, but 1 are named"):
+        PolicyController(policy, {"roles": ["cover"]})
+
+
+def test_held_out_episodes_are_scored_as_the_records_say():
+    model = tiny_policy()
+    scores = SceneEvaluator(TINY, 25, seed=2)(model)
+    records = run_episodes(PolicyController(model), TINY, 25, 2**32 + 2)
+    assert scores["cover"] == pytest.approx(summarize(records)["cover"]["mean"] / 100)
+    assert scores["n_episodes"] == 25
+    # No training team has such a seed.
+    assert max(team_seeds(0, 1000)) < 2**32 == held_out_seed(0)

@@ -17,7 +17,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.preprocessing import is_image_space
 
 from area_search import AreaSearchEnv, SceneError
-from area_search.batch import observation_space
+from area_search.arrays import observation_space
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "hard": {},

@@ -18,11 +18,12 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 from torch import nn
 
+from sb3_roles.common.policies import POSITION_KEY, STATE_KEY
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, RoleWrapper
 from sb3_roles.common.team_wrapper import AGENT_KEY
 from sb3_roles.common.torch_layers import CHANNELS, MapEncoder, symlog
 
-_NOT_SEEN = ("state", "position", AGENT_KEY, ROLE_DUE_KEY)
+_NOT_SEEN = (STATE_KEY, POSITION_KEY, AGENT_KEY, ROLE_DUE_KEY)
 _SMALL_MAP = 12
 
 
@@ -101,8 +102,37 @@ def open_moves(local: np.ndarray) -> np.ndarray:
     return allowed
 
 
-class MaskWrapper(VecEnvWrapper):
-    """Offers ``action_masks`` to MaskablePPO, and takes no other part.
+class OwnViewWrapper(VecEnvWrapper):
+    """Takes the state out of the observations: these policies must act without it.
+
+    :param venv: a ``RoleWrapper``
+    """
+
+    def __init__(self, venv: RoleWrapper) -> None:
+        space = venv.observation_space
+        assert isinstance(space, spaces.Dict)
+        kept = {key: one for key, one in space.spaces.items() if key != STATE_KEY}
+        super().__init__(venv, observation_space=spaces.Dict(kept))
+
+    def reset(self) -> Any:
+        """Start new episodes."""
+        observations: Any = self.venv.reset()
+        observations.pop(STATE_KEY, None)
+        return observations
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Finish the step."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(observations, dict)
+        observations.pop(STATE_KEY, None)
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"].pop(STATE_KEY, None)
+        return observations, rewards, dones, infos
+
+
+class MaskWrapper(OwnViewWrapper):
+    """Offers ``action_masks`` to MaskablePPO.
 
     A role that goes on is the only one allowed. Blocked moves are known for area search; other
     environments allow all moves.
@@ -127,11 +157,11 @@ class MaskWrapper(VecEnvWrapper):
 
     def reset(self) -> Any:
         """Start new episodes."""
-        return self._look(self.venv.reset())
+        return self._look(super().reset())
 
     def step_wait(self) -> VecEnvStepReturn:
         """Finish the step."""
-        observations, rewards, dones, infos = self.venv.step_wait()
+        observations, rewards, dones, infos = super().step_wait()
         return self._look(observations), rewards, dones, infos
 
     def has_attr(self, attr_name: str) -> bool:

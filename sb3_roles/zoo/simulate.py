@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from area_search.scenes import Scene
     from sb3_roles.baselines.base import Controller
-    from sb3_roles.zoo.options import Subparsers
+    from sb3_roles.zoo.options import Parser, Subparsers
 
 _NOTES = {
     "explo_paper": "the paper's: newly seen cells / free cells, can exceed 100 %",
@@ -53,6 +53,12 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="NAME",
         help=f"one of {', '.join(CONTROLLER_NAMES)}",
     )
+    add_episode_options(parser)
+    parser.set_defaults(run=run)
+
+
+def add_episode_options(parser: Parser) -> None:
+    """Add the options that say which episodes are played, and what is reported of them."""
     add_scene_options(parser)
     parser.add_argument(
         "--episodes", type=whole_number(1, 10**7), default=500, metavar="N", help="number of them"
@@ -81,7 +87,6 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="FILE.png",
         help="also draw the last frame of the first episode",
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: Namespace) -> int:
@@ -92,13 +97,24 @@ def run(args: Namespace) -> int:
     :raises UsageError: if the options do not describe a scene
     """
     scene = scene_of(args)
-    _check_render(args.render)
-
     # Numba takes its time to import: not before the arguments are known to be right.
+    _check_render(args.render)
+    return play(args, controller_class(args.controller)(), scene)
+
+
+def play(args: Namespace, controller: Controller, scene: Scene) -> int:
+    """Play the episodes of :func:`add_episode_options` and print the metrics.
+
+    :param args: parsed arguments; ``controller`` is what the report calls it
+    :param controller: who acts
+    :param scene: the task
+    :return: exit code
+    :raises UsageError: if the picture can not be written
+    """
+    _check_render(args.render)
     from sb3_roles.evaluation.episodes import run_episodes
     from sb3_roles.evaluation.metrics import summarize
 
-    controller = controller_class(args.controller)()
     records = run_episodes(
         controller, scene, args.episodes, args.seed, args.first_episode, args.batch_size
     )
@@ -169,14 +185,18 @@ def _render(controller: Controller, scene: Scene, seed: int, episode: int, path:
     from area_search.render import draw_frame
     from sb3_roles.evaluation.episodes import Player
 
-    batch = BatchedAreaSearch(scene, 1)
+    batch = BatchedAreaSearch(scene, 1, str(getattr(controller, "sub_goal", "none")))
     batch.reset([seed], episode)
     player = Player(controller, batch)
     trail = []
     while not (batch.terminated[0] or batch.truncated[0]):
         trail.append(batch.position[0].copy())
         player.step()
-    frame = draw_frame(batch.snapshot(0, path=np.array(trail)))
+    shown: dict[str, Any] = {"path": np.array(trail)}
+    if player.roles is not None:
+        shown["roles"] = player.roles[0]
+        shown["role_names"] = getattr(controller, "role_names", ("explore", "cover"))
+    frame = draw_frame(batch.snapshot(0, **shown))
     image = io.BytesIO()
     pygame.image.save(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), image, "frame.png")
     path.write_bytes(image.getvalue())

@@ -7,11 +7,12 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from sb3_roles.zoo.options import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 ENDINGS = (".mp4", ".gif")
 _PACKAGES = {".mp4": ("imageio_ffmpeg", "imageio-ffmpeg"), ".gif": ("PIL", "pillow")}
@@ -58,6 +59,9 @@ class VideoWriter:
 
         :param frame: uint8 (height, width, 3), each of the size of the first
         """
+        # Numpy and the encoders are not loaded before the arguments are known to be right.
+        import numpy as np
+
         self.n_frames += 1
         if self.path.suffix.lower() == ".gif":
             image = import_module("PIL.Image").fromarray(frame)

@@ -1,0 +1,267 @@
+"""The memory of a batch of teams: its arrays, and copies of them to continue from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from area_search import assignment, kernels, paths
+from area_search import cells as layout
+from area_search.cells import N_ACTIONS
+from area_search.rewards import MAX_ROLES, REWARD_COMPONENTS
+from area_search.scenes import Scene, unknown
+
+# Everything that the future of a run depends on, and what the last step reported. All else is
+# derived from it.
+_STATE_ARRAYS = (
+    "keys",
+    "episodes",
+    "episode_stride",
+    "cells",
+    "position",
+    "roles",
+    "idle",
+    "steps",
+    "totals",
+    "new_cells",
+    "new_targets",
+    "reward_components",
+    "rewards",
+    "metric_values",
+    "terminated",
+    "truncated",
+)
+
+
+def observation_space(scene: Scene, sub_goal: str = "none") -> spaces.Dict:
+    """Return one robot's observation space; no shape depends on the number of robots.
+
+    :param scene: the task
+    :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :return: flat Dict of ``local`` uint8 (4, side, side), ``joint`` uint8 (2, height, width),
+        ``position`` float32 (2,), ``state`` uint8 (5, height, width) and, unless ``sub_goal`` is
+        ``"none"``, ``sub_goal`` float32 (2, 6) or (2, 11)
+    :raises ValueError: if ``sub_goal`` is unknown
+    """
+    if sub_goal not in paths.SUB_GOALS:
+        raise ValueError(unknown("sub_goal", sub_goal, paths.SUB_GOALS))
+    side = 2 * scene.view_radius + 1
+    size = (scene.height, scene.width)
+    last = np.array([scene.height - 1, scene.width - 1], np.float32)
+    boxes: dict[str, spaces.Space] = {
+        "local": spaces.Box(0, 1, (len(layout.LOCAL_CHANNELS), side, side), np.uint8),
+        "joint": spaces.Box(0, 1, (len(layout.JOINT_CHANNELS), *size), np.uint8),
+        "position": spaces.Box(np.zeros(2, np.float32), last, (2,), np.float32),
+        "state": spaces.Box(0, 1, (len(layout.STATE_CHANNELS), *size), np.uint8),
+    }
+    if sub_goal != "none":
+        high = np.full((len(paths.GOAL_SETS), paths.sub_goal_width(sub_goal)), np.inf, np.float32)
+        high[:, : N_ACTIONS + 1] = 1.0
+        boxes["sub_goal"] = spaces.Box(np.zeros_like(high), high, high.shape, np.float32)
+    return spaces.Dict(boxes)
+
+
+class TeamArrays:
+    """All arrays of a batch, allocated once, and the kernels' arguments made of them.
+
+    :param scene: the task
+    :param n_teams: number of teams
+    :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    """
+
+    def __init__(self, scene: Scene, n_teams: int, sub_goal: str) -> None:
+        self.scene = scene
+        self.n_teams = n_teams
+        self.n_agents = scene.n_agents
+        self.sub_goal = sub_goal
+        self.observation_space = observation_space(scene, sub_goal)
+        self._started = False
+        self._allocate()
+
+    def _allocate(self) -> None:
+        scene, m, n = self.scene, self.n_teams, self.n_agents
+        self._border = layout.border_width(scene.view_radius, scene.sensor_radius)
+        height, width = scene.height, scene.width
+        padded = (height + 2 * self._border, width + 2 * self._border)
+
+        self.keys = np.zeros((m, 2), np.uint64)
+        self.episodes = np.zeros(m, np.int64)
+        self.episode_stride = np.ones(m, np.int64)
+        self.cells = np.zeros((m, *padded), np.uint8)
+        self.position = np.zeros((m, n, 2), np.int32)
+        self.roles = np.zeros((m, n), np.int8)
+        self.idle = np.zeros((m, n), np.int32)
+        self.steps = np.zeros(m, np.int32)
+        self.totals = np.zeros((m, kernels.N_TOTALS), np.int64)
+        self.new_cells = np.zeros((m, n), np.int32)
+        self.new_targets = np.zeros((m, n), np.int32)
+        self.reward_components = np.zeros((m, n, len(REWARD_COMPONENTS)), np.float32)
+        self.rewards = np.zeros((m, n), np.float32)
+        self.metric_values = np.zeros((m, len(kernels.METRICS)), np.float64)
+        self.terminated = np.zeros(m, np.bool_)
+        self.truncated = np.zeros(m, np.bool_)
+
+        self._unseen = np.zeros_like(self.cells)
+        self._goals = np.zeros((m, len(paths.GOAL_SETS)), np.int64)
+        self._everyone = np.ones(m, np.bool_)
+
+        # Channels last, so that the views below are what a convolution on CPU wants.
+        side = 2 * scene.view_radius + 1
+        local = np.zeros((m, n, side, side, len(layout.LOCAL_CHANNELS)), np.uint8)
+        self._local_words = local.view(np.uint32)[..., 0]
+        self._joint = np.zeros((m, height, width, len(layout.JOINT_CHANNELS)), np.uint8)
+        self._state = np.zeros((m, height, width, len(layout.STATE_CHANNELS)), np.uint8)
+        self._coordinates = np.zeros((m, n, 2), np.float32)
+        self.observations: dict[str, np.ndarray] = {
+            "local": np.moveaxis(local, -1, -3),
+            "joint": np.moveaxis(self._joint, -1, -3),
+            "position": self._coordinates,
+            "state": np.moveaxis(self._state, -1, -3),
+        }
+        if self.sub_goal != "none":
+            shape = self.observation_space["sub_goal"].shape or ()
+            self.observations["sub_goal"] = np.zeros((m, n, *shape), np.float32)
+        self.first_team = {key: value[0] for key, value in self.observations.items()}
+        self.metrics = {name: self.metric_values[:, k] for k, name in enumerate(kernels.METRICS)}
+        self._bind_kernels()
+
+    def _bind_kernels(self) -> None:
+        """Gather each kernel's arguments once: they are the same arrays at every step."""
+        scene = self.scene
+        maps = (self.cells, self._unseen, self._joint, self._state, self._goals, self.position)
+        self._reset_arguments: tuple[Any, ...] = (
+            self.keys,
+            self.episodes,
+            scene.n_free,
+            scene.n_targets,
+            float(scene.spawn_sigma),
+            float(scene.spawn_sigma_growth),
+            self._border,
+            layout.disc_offsets(scene.sensor_radius),
+            *maps,
+            self.idle,
+            self.steps,
+            self.totals,
+            np.zeros(scene.n_cells, np.int64),  # free_cells
+        )
+        edges, edge_counts = layout.edge_offsets(layout.disc_offsets(scene.sensor_radius))
+        self._step_arguments: tuple[Any, ...] = (
+            self._border,
+            edges,
+            edge_counts,
+            scene.horizon,
+            scene.early_stop_patience or 0,
+            scene.n_free,
+            scene.n_targets,
+            float(scene.explore_normalizer),
+            scene.reward_sharing == "same_role",
+            float(scene.alpha),
+            float(scene.beta),
+            self.roles,
+            *maps,
+            self.idle,
+            self.steps,
+            self.totals,
+            self.new_cells,
+            self.new_targets,
+            self.reward_components,
+            self.rewards,
+            self.metric_values,
+            self.terminated,
+            self.truncated,
+            np.zeros(edges.shape[1:], np.int64),  # fresh
+        )
+        self._observe_arguments: tuple[Any, ...] = (
+            self.cells,
+            self.position,
+            self._border,
+            layout.window_table(),
+            layout.window_masks(scene.view_radius, scene.communication_radius),
+            self._local_words,
+            self._coordinates,
+        )
+        if self.sub_goal != "none":
+            scratch = paths.search_scratch(self.sub_goal, self.n_agents, self.cells[0].size)
+            self._sub_goal_arguments: tuple[Any, ...] = (
+                self.cells,
+                self._border,
+                self.position,
+                self._goals,
+                *scratch,
+                self.observations["sub_goal"],
+            )
+
+    def _observe(self, which: np.ndarray) -> None:
+        kernels.observe_teams(which, *self._observe_arguments)
+        if self.sub_goal == "nearest":
+            paths.nearest_sub_goals(which, *self._sub_goal_arguments)
+        elif self.sub_goal == "assigned":
+            assignment.assigned_sub_goals(which, *self._sub_goal_arguments)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Copy the whole simulation.
+
+        :return: plain arrays by name; :meth:`set_state` continues from them bit for bit
+        """
+        return {name: getattr(self, name).copy() for name in _STATE_ARRAYS}
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from a copy of the simulation, made by a batch of the same scene and size.
+
+        :param state: what :meth:`get_state` returned
+        :raises ValueError: if an array is missing or unknown, or has another shape or type;
+            nothing is changed then
+        """
+        if set(state) != set(_STATE_ARRAYS):
+            wrong = sorted(set(state) ^ set(_STATE_ARRAYS))
+            raise ValueError(f"state does not fit: missing or unknown arrays {', '.join(wrong)}")
+        for name in _STATE_ARRAYS:
+            have, want = np.asarray(state[name]), getattr(self, name)
+            if have.shape != want.shape or have.dtype != want.dtype:
+                raise ValueError(
+                    f"state does not fit: {name} must be {want.dtype} of shape {want.shape}, "
+                    f"got {have.dtype} of shape {have.shape}"
+                )
+        position, roles = np.asarray(state["position"]), np.asarray(state["roles"])
+        if np.any(position < 0) or np.any(position >= (self.scene.height, self.scene.width)):
+            raise ValueError("state does not fit: a position is not on the map")
+        self._check_cells(np.asarray(state["cells"]), position)
+        if np.any(roles < 0) or np.any(roles >= MAX_ROLES):
+            raise ValueError(f"state does not fit: roles must be in 0..{MAX_ROLES - 1}")
+        for name in _STATE_ARRAYS:
+            getattr(self, name)[:] = state[name]
+        self._started = True
+        for m in range(self.n_teams):
+            kernels.rebuild(
+                self.cells[m],
+                self._unseen[m],
+                self._joint[m],
+                self._state[m],
+                self._goals[m],
+                self._border,
+            )
+        self._observe(self._everyone)
+
+    def _check_cells(self, cells: np.ndarray, position: np.ndarray) -> None:
+        # Moves and searches rely on the border instead of checking bounds.
+        inside = np.zeros(cells.shape[1:], np.bool_)
+        inside[self._border : -self._border, self._border : -self._border] = True
+        if np.any(cells[:, ~inside] != layout.BORDER):
+            raise ValueError("state does not fit: the maps have another size or border")
+        row, column = position[..., 0] + self._border, position[..., 1] + self._border
+        under = cells[np.arange(self.n_teams)[:, None], row, column]
+        if np.any(under & layout.OBSTACLE):
+            raise ValueError("state does not fit: a robot is on an obstacle")
+
+    # Pickling (SuperSuit copies environments that way) would tear the views of one memory apart.
+    def __getstate__(self) -> dict[str, Any]:
+        options = {"scene": self.scene, "n_teams": self.n_teams, "sub_goal": self.sub_goal}
+        return {"options": options, "arrays": self.get_state() if self._started else None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["options"])  # type: ignore[misc]
+        if state["arrays"] is not None:
+            self.set_state(state["arrays"])

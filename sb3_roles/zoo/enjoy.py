@@ -1,0 +1,289 @@
+"""``sb3-roles enjoy``: play episodes with a trained policy, on the screen or into a video."""
+
+from __future__ import annotations
+
+import os
+import sys
+from argparse import Namespace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_roles.zoo.options import (
+    MAX_SEED,
+    KeyValues,
+    UsageError,
+    int_text,
+    key_value,
+    output_file,
+    positive_number,
+    whole_number,
+)
+from sb3_roles.zoo.video import ENDINGS, VideoWriter, check_video
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from sb3_roles.evaluation.policies import PolicyController
+    from sb3_roles.zoo.options import Subparsers
+    from sb3_roles.zoo.playback import Show
+
+_PERCENT = ("explo_paper", "explo_true", "cover")
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A trained policy and how it was trained.
+
+    :param folder: of the run
+    :param config: what its ``config.yml`` says
+    :param model: an SB3 model or policy
+    """
+
+    folder: Path
+    config: Mapping[str, Any]
+    model: Any
+
+    def controller(self, deterministic: bool, communicate: bool) -> PolicyController:
+        """Return the policy as a controller of episodes."""
+        from sb3_roles.evaluation.policies import PolicyController
+
+        roles = self.config.get("wrapper_kwargs") or {}
+        try:
+            return PolicyController(self.model, roles, deterministic, communicate)
+        except ValueError as error:
+            raise UsageError(f"{self.folder}: {error}") from error
+
+
+def load_run(folder: Path, best: bool = False, device: str = "auto") -> LoadedRun:
+    """Load the policy of a run folder.
+
+    :param folder: the run
+    :param best: the best policy of its evaluations instead of the last one
+    :param device: where the policy computes
+    :raises UsageError: if it is no run folder, or damaged
+    """
+    from sb3_roles.zoo.config import read_run_config
+
+    config = read_run_config(folder)
+
+    # Torch takes its time to import: not before the folder is known to be a run.
+    from sb3_roles.zoo.models import load_model
+
+    return LoadedRun(folder, config, load_model(folder, best=best, device=device))
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "enjoy",
+        help="watch a trained policy",
+        description="Play episodes with a trained policy and print their metrics; in a window "
+        "where there is a display, or into a video.",
+    )
+    parser.add_argument("--algo", default="hmappo", metavar="NAME", help="that was trained")
+    parser.add_argument(
+        "--env", default="area-search-v0", metavar="NAME", help="environment, or module:factory"
+    )
+    parser.add_argument(
+        "-f",
+        "--folder",
+        type=Path,
+        default=Path("logs"),
+        metavar="DIR",
+        help="of the logs, or a run",
+    )
+    parser.add_argument(
+        "--exp-id", type=whole_number(0, 10**9), default=0, metavar="N", help="run; 0: the latest"
+    )
+    parser.add_argument("--load-best", action="store_true", help="the best evaluated policy")
+    add_play_options(parser)
+    parser.add_argument(
+        "--video",
+        type=output_file(*ENDINGS),
+        metavar="FILE",
+        help="write an animation, .mp4 or .gif",
+    )
+    parser.add_argument("--scene", default=None, metavar="NAME", help="another scene (area search)")
+    parser.add_argument(
+        "--n-agents", type=int_text, default=None, metavar="N", help="another team size"
+    )
+    parser.add_argument(
+        "--env-kwargs",
+        type=key_value,
+        nargs="+",
+        action=KeyValues,
+        default={},
+        metavar="KEY:VALUE",
+        help="arguments of the environment to change",
+    )
+    parser.add_argument(
+        "--episodes", type=whole_number(1, 10**6), default=1, metavar="N", help="number of them"
+    )
+    parser.add_argument(
+        "--seed", type=whole_number(0, MAX_SEED), default=0, metavar="N", help="of the episodes"
+    )
+    parser.add_argument("--no-render", action="store_true", help="open no window")
+    parser.add_argument(
+        "--fps", type=positive_number(240), default=5.0, metavar="X", help="frames per second"
+    )
+    parser.set_defaults(run=run)
+
+
+def add_play_options(parser: Any) -> None:
+    """Add the options that say how a policy acts."""
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument(
+        "--deterministic", action="store_true", help="take the likeliest actions (the default)"
+    )
+    choice.add_argument("--stochastic", action="store_true", help="draw the actions")
+    parser.add_argument(
+        "--no-communication", action="store_true", help="no messages between robots"
+    )
+    parser.add_argument("--device", default="auto", metavar="NAME", help="cpu, cuda, or auto")
+
+
+def run(args: Namespace) -> int:
+    """Play the episodes.
+
+    :param args: parsed arguments
+    :return: exit code
+    :raises UsageError: if there is no such run, or an option does not fit it
+    """
+    from sb3_roles.zoo.algorithms import get_algorithm
+    from sb3_roles.zoo.config import CONFIG_FILE
+    from sb3_roles.zoo.run_folder import find_run
+
+    try:
+        get_algorithm(args.algo)
+    except ValueError as error:
+        raise UsageError(f"argument --algo: {error}") from None
+    if args.video is not None:
+        check_video(args.video)
+    folder = args.folder
+    if not (folder / CONFIG_FILE).is_file():
+        folder = find_run(folder, args.algo, args.env, args.exp_id)
+    loaded = load_run(folder, args.load_best, args.device)
+    controller = loaded.controller(not args.stochastic, not args.no_communication)
+    config = _changed(loaded.config, args)
+    print(f"{config['algo']} on {config['env']}, {loaded.folder}")
+    with _display(args) as show:
+        outcomes = []
+        for episode, (metrics, roles) in enumerate(_episodes(controller, config, args, show)):
+            outcomes.append(metrics)
+            print(f"episode {episode}: {_line(metrics, roles, controller.role_names)}", flush=True)
+    if len(outcomes) > 1:
+        names = [name for name in outcomes[0] if not name.startswith("t90")]
+        means = {name: sum(outcome[name] for outcome in outcomes) / len(outcomes) for name in names}
+        print(f"mean of {len(outcomes)}: {_line(means)}")
+    if args.video is not None:
+        print(f"wrote {args.video}")
+    return 0
+
+
+def _changed(config: Mapping[str, Any], args: Namespace) -> dict[str, Any]:
+    """Return the configuration of the run with the changes of the command line."""
+    from sb3_roles.zoo.environments import AREA_SEARCH, env_problems
+
+    options = dict(config.get("env_kwargs") or {})
+    if config["env"] == AREA_SEARCH:
+        # For training only: an episode that is watched is played to its end.
+        options.pop("early_stop_patience", None)
+    options.update(args.env_kwargs)
+    for name in ("scene", "n_agents"):
+        if getattr(args, name) is not None:
+            options[name] = getattr(args, name)
+    found = env_problems(config["env"], options)
+    if found:
+        raise UsageError("; ".join(found))
+    return {**config, "env_kwargs": options}
+
+
+def _episodes(
+    controller: PolicyController, config: Mapping[str, Any], args: Namespace, show: Show | None
+) -> Iterator[tuple[dict[str, float], np.ndarray]]:
+    from sb3_roles.common.team_vec_env import team_seeds
+    from sb3_roles.zoo.environments import AREA_SEARCH, env_factory, scene_of_run
+    from sb3_roles.zoo.playback import play_env, play_scene
+
+    try:
+        if config["env"] == AREA_SEARCH:
+            scene, links = scene_of_run(config), controller.communicate
+            for episode in range(args.episodes):
+                yield play_scene(controller, scene, args.seed, episode, show, links)
+            return
+        drawn = {} if show is None else {"render_mode": "rgb_array"}
+        env = env_factory(config["env"], {**config["env_kwargs"], **drawn})()
+        try:
+            for seed in team_seeds(args.seed, args.episodes):
+                yield play_env(controller, env, seed, show)
+        finally:
+            env.close()
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
+@contextmanager
+def _display(args: Namespace) -> Iterator[Show | None]:
+    """Give what takes the frames: a video, a window, or None where nothing is drawn."""
+    if args.video is not None:
+        with VideoWriter(args.video, args.fps) as video:
+            yield video.add
+        return
+    if args.no_render or not _has_screen():
+        if not args.no_render:
+            print("no display: metrics only; --video FILE.gif makes an animation")
+        yield None
+        return
+    from area_search.render import Window
+
+    window = Window(f"{args.algo} on {args.env}")
+
+    def show(frame: np.ndarray) -> None:
+        if not window.show(frame, args.fps):
+            raise KeyboardInterrupt
+
+    try:
+        yield show
+    finally:
+        window.close()
+
+
+def _has_screen() -> bool:
+    if sys.platform in ("darwin", "win32"):
+        return True
+    names = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    return any(os.environ.get(name) for name in names)
+
+
+def _line(
+    metrics: Mapping[str, float],
+    roles: np.ndarray | None = None,
+    role_names: Sequence[str] = (),
+) -> str:
+    parts = []
+    for name, value in metrics.items():
+        if name in _PERCENT:
+            parts.append(f"{name} {100 * value:.1f} %")
+        elif name.startswith("t90") and value < 0:
+            parts.append(f"{name} -")
+        else:
+            parts.append(f"{name} {value:g}")
+    if roles is not None and roles.size and roles.min() >= 0:
+        parts += [f"{name} {100 * (roles == k).mean():.0f} %" for k, name in enumerate(role_names)]
+        if len(roles) > 1:
+            parts.append(f"role switches {100 * (roles[1:] != roles[:-1]).mean():.0f} %")
+    return ", ".join(parts)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command, for ``enjoy.py``.
+
+    :param argv: arguments without the name of the program
+    :return: exit code
+    """
+    from sb3_roles.zoo.cli import main as run_command
+
+    return run_command(["enjoy", *(sys.argv[1:] if argv is None else argv)])

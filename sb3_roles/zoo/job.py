@@ -1,0 +1,221 @@
+"""One training job, from its configuration to the evaluation of what was learned."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import (
+    HumanOutputFormat,
+    KVWriter,
+    Logger,
+    TensorBoardOutputFormat,
+)
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from sb3_roles.common import snapshot
+from sb3_roles.common.callbacks import EvaluationCallback, RoleCallback, TeamMetricsCallback
+from sb3_roles.common.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointFolder,
+    write_checkpoint,
+)
+from sb3_roles.common.team_wrapper import find_team_env
+from sb3_roles.zoo.algorithms import get_algorithm
+from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run
+from sb3_roles.zoo.models import make_env, make_model
+from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.run_folder import BEST_FILE, CHECKPOINTS
+from sb3_roles.zoo.train import open_run
+from sb3_roles.zoo.training import CsvLog, StopSignals, train
+
+# The periodic evaluation picks the best policy; the last one is on other episodes.
+_PERIODIC_SEED, _FINAL_SEED = 0, 1
+_MAX_EVAL_TEAMS = 8
+
+
+class TrainingFailed(Exception):
+    """Training can not go on, because a number is not finite; the message is one line."""
+
+
+def run_job(job: Mapping[str, Any]) -> int:
+    """Train in a run folder, and evaluate.
+
+    :param job: ``config``, ``options`` and ``resume``, plain data of ``zoo.train``
+    :return: exit code: 0, or 130 or 143 after a signal
+    :raises UsageError: if environment, configuration or checkpoint do not fit
+    :raises TrainingFailed: if a number is not finite
+    """
+    config, options = job["config"], job["options"]
+    if options["device"] == "cuda" and not th.cuda.is_available():
+        raise UsageError("--device cuda: torch finds no GPU")
+    if options["num_threads"] is not None:
+        th.set_num_threads(options["num_threads"])
+    # Before the folder is made: a wrong environment must leave nothing behind.
+    env = make_env(config)
+    try:
+        model = make_model(config, env, options["device"])
+        run, lock = open_run(job)
+        try:
+            return _train_in(run, model, job)
+        finally:
+            lock.release()
+    finally:
+        env.close()
+
+
+def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> int:
+    config, options = job["config"], job["options"]
+    checkpoints = CheckpointFolder(run / CHECKPOINTS)
+    checkpoints.prepare()
+    resume = None if job["resume"] is None else _read_newest(checkpoints, model, config)
+    log = CsvLog(run / "progress.csv")
+    model.set_logger(_logger(run, log, config, options))
+    callbacks: list[Any] = [TeamMetricsCallback()]
+    if get_algorithm(config["algo"]).wrapper == "role":
+        callbacks.append(RoleCallback(path=run / "roles.csv"))
+    if options["eval_freq"]:
+        callbacks.append(
+            EvaluationCallback(
+                eval_freq=options["eval_freq"],
+                n_episodes=options["eval_episodes"],
+                seed=_PERIODIC_SEED,
+                evaluate=make_evaluate(config, options["eval_episodes"], _PERIODIC_SEED),
+                folder=run,
+                save=save_best,
+                verbose=options["verbose"],
+            )
+        )
+    _print_start(run, model, config, resume)
+    stop = StopSignals()
+    try:
+        with stop.caught():
+            train(
+                model,
+                config["n_timesteps"],
+                checkpoints,
+                stop,
+                callbacks,
+                stateful=[log, *callbacks],
+                config=config,
+                resume=resume,
+                save_freq=options["save_freq"],
+                log_interval=options["log_interval"],
+                progress_bar=options["progress"],
+            )
+    except FloatingPointError as error:
+        raise TrainingFailed(f"{run}: {error}") from error
+    except CheckpointError as error:
+        raise UsageError(f"{run}: {error}") from error
+    steps = model.num_timesteps // find_team_env(model.env).n_agents
+    print(f"{run}: {steps} joint steps, {len(checkpoints.paths())} checkpoints", flush=True)
+    if stop.received is not None:
+        print(f"stopped; to go on: train.py --resume {run}", flush=True)
+        return stop.exit_code
+    _evaluate(run, model, config, options["eval_episodes"])
+    return 0
+
+
+def _read_newest(
+    checkpoints: CheckpointFolder, model: OnPolicyAlgorithm, config: Mapping[str, Any]
+) -> Checkpoint:
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            _, checkpoint = checkpoints.newest()
+    except CheckpointError as error:
+        raise UsageError(str(error)) from error
+    for warning in caught:
+        print(f"warning: {warning.message}", flush=True)
+    assert model.env is not None
+    # Threads are chosen here, the rest is what it is.
+    saved = dict(checkpoint.manifest.get("machine", {}))
+    reasons = snapshot.differences(saved, snapshot.machine_facts(model.device))
+    gap = snapshot.env_gap(model.env)
+    reasons += [] if gap is None else [gap]
+    before = checkpoint.manifest.get("config", {}).get("n_timesteps")
+    if before != config["n_timesteps"]:
+        reasons.append(f"n_timesteps was {before}, is {config['n_timesteps']}")
+    if reasons:
+        print(f"not bit-exact: {'; '.join(reasons)}", flush=True)
+    return checkpoint
+
+
+def _logger(
+    run: Path, log: CsvLog, config: Mapping[str, Any], options: Mapping[str, Any]
+) -> Logger:
+    import sys
+
+    writers: list[KVWriter] = [log]
+    if options["verbose"] and not options["progress"]:
+        writers.append(HumanOutputFormat(sys.stdout))
+    if options["tensorboard_log"] is not None:
+        try:
+            name = f"{config['algo']}_{folder_name(run.name)}"
+            writers.append(TensorBoardOutputFormat(str(Path(options["tensorboard_log"]) / name)))
+        except AssertionError as error:
+            raise UsageError(f"--tensorboard-log: {error}") from error
+    return Logger(str(run), writers)
+
+
+def save_best(model: BaseAlgorithm, folder: Path, record: Mapping[str, Any]) -> None:
+    """Write the best policy's weights for ``load_model(run, best=True)``.
+
+    :param model: the model
+    :param folder: ``best/`` of the run
+    :param record: its scores
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    manifest = {"record": dict(record), "agent_steps": model.num_timesteps}
+    write_checkpoint(folder / BEST_FILE, manifest, model.policy.state_dict())
+
+
+def make_evaluate(config: Mapping[str, Any], n_episodes: int, seed: int) -> Any:
+    """Make what evaluates a model on held-out episodes of its task.
+
+    :param config: checked
+    :param n_episodes: team episodes
+    :param seed: of the held-out stream
+    """
+    from sb3_roles.evaluation.evaluators import SceneEvaluator, VecEnvEvaluator
+
+    if config["env"] == AREA_SEARCH:
+        return SceneEvaluator(scene_of_run(config), n_episodes, seed)
+    env = make_env(config, min(_MAX_EVAL_TEAMS, n_episodes))
+    return VecEnvEvaluator(env, n_episodes, seed)
+
+
+def _evaluate(
+    run: Path, model: OnPolicyAlgorithm, config: Mapping[str, Any], n_episodes: int
+) -> None:
+    scores = make_evaluate(config, n_episodes, _FINAL_SEED)(model)
+    write_yaml(run / "evaluation.yml", {"episodes": n_episodes, "scores": dict(scores)})
+    shown = ("explo_paper", "explo_true", "cover")
+    if config["env"] == AREA_SEARCH:
+        text = ", ".join(f"{name} {100 * scores[name]:.1f} %" for name in shown)
+    else:
+        text = ", ".join(f"{name} {value:.4g}" for name, value in scores.items())
+    print(f"{n_episodes} held-out episodes: {text}", flush=True)
+
+
+def _print_start(
+    run: Path, model: OnPolicyAlgorithm, config: Mapping[str, Any], resume: Checkpoint | None
+) -> None:
+    team_env = find_team_env(model.env)
+    begun = 0 if resume is None else resume.manifest.get("env_steps", 0)
+    print(
+        f"{'resuming' if resume else 'training'} {config['algo']} on {config['env']}: "
+        f"{team_env.n_teams} teams of {team_env.n_agents} ({type(team_env).__name__}), joint steps "
+        f"{begun} to {config['n_timesteps']}, seed {config['seed']}, {model.device.type}, "
+        f"{th.get_num_threads()} threads, OMP_WAIT_POLICY={os.environ.get('OMP_WAIT_POLICY')}\n"
+        f"run folder {run}, {time.strftime('%Y-%m-%d %H:%M:%S')}",
+        flush=True,
+    )

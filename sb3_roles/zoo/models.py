@@ -1,0 +1,114 @@
+"""Environments and models from a checked configuration, and trained models from a run folder."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder, read_checkpoint
+from sb3_roles.common.role_wrapper import RoleWrapper
+from sb3_roles.common.snapshot import load_weights
+from sb3_roles.common.team_vec_env import make_team_vec_env
+from sb3_roles.common.team_wrapper import TeamWrapper, find_team_env
+from sb3_roles.zoo.algorithms import get_algorithm
+from sb3_roles.zoo.config import read_run_config
+from sb3_roles.zoo.environments import AREA_SEARCH, env_factory
+from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.run_folder import BEST, BEST_FILE, CHECKPOINTS
+
+
+def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
+    """Make the environment of a configuration, with its wrappers.
+
+    :param config: checked, see ``zoo.config``
+    :param n_envs: teams; by default the configuration's
+    :return: rows are robots; not seeded, which the model does
+    :raises UsageError: if the environment does not fit
+    """
+    algorithm = get_algorithm(config["algo"])
+    factory = env_factory(config["env"], config["env_kwargs"])
+    try:
+        venv: VecEnv = make_team_vec_env(
+            factory,
+            config["n_envs"] if n_envs is None else n_envs,
+            backend=config["vec_env"],
+            expand_team_observations=not algorithm.whole_teams,
+        )
+        if algorithm.wrapper == "team":
+            return TeamWrapper(venv)
+        roles = RoleWrapper(venv, **config["wrapper_kwargs"], seed=config["seed"])
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"environment {config['env']}: {error}") from error
+    if algorithm.whole_teams:
+        return roles
+    from sb3_roles.zoo.row_policies import MaskWrapper, OwnViewWrapper
+
+    if algorithm.masks:
+        return MaskWrapper(roles, blocked_moves=config["env"] == AREA_SEARCH)
+    return OwnViewWrapper(roles)
+
+
+def make_model(
+    config: Mapping[str, Any], env: VecEnv, device: str = "auto", verbose: int = 0
+) -> OnPolicyAlgorithm:
+    """Make the untrained model of a configuration.
+
+    :param config: checked, see ``zoo.config``
+    :param env: of :func:`make_env`
+    :param device: where to train
+    :param verbose: see the algorithm
+    :raises UsageError: if the configuration and the environment do not fit
+    """
+    algorithm = get_algorithm(config["algo"])
+    arguments = algorithm.arguments(config, find_team_env(env).n_agents)
+    try:
+        model: OnPolicyAlgorithm = algorithm.load()(
+            algorithm.policy(config["policy"]),
+            env,
+            **arguments,
+            seed=config["seed"] % 2**32,
+            device=device,
+            verbose=verbose,
+        )
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise UsageError(f"{config['algo']}: {error}") from error
+    return model
+
+
+def load_model(run: str | Path, best: bool = False, device: str = "auto") -> OnPolicyAlgorithm:
+    """Rebuild a run's model from ``config.yml``, and load its weights.
+
+    No code of the folder runs, and nothing in it is unpickled. The model has an environment of one
+    team, which was never reset.
+
+    :param run: the run folder
+    :param best: the weights that evaluated best, instead of the latest ones
+    :param device: where the model shall be
+    :raises UsageError: if the folder is no run, or its weights are damaged or do not fit
+    """
+    folder = Path(run)
+    config = read_run_config(folder)
+    small = {**config, "n_envs": 1}
+    if "batch_size" in config:
+        # Of one team now; nothing is trained with it.
+        small["batch_size"] = config.get("n_steps", 1)
+    try:
+        if best:
+            checkpoint = read_checkpoint(folder / BEST / BEST_FILE)
+        else:
+            _, checkpoint = CheckpointFolder(folder / CHECKPOINTS).newest()
+        with warnings.catch_warnings(), th.random.fork_rng(devices=[]):
+            warnings.filterwarnings("ignore", category=UserWarning, module="stable_baselines3")
+            model = make_model(small, make_env(small), device)
+        load_weights(model, checkpoint)
+    except CheckpointError as error:
+        raise UsageError(str(error)) from error
+    model.num_timesteps = int(checkpoint.manifest.get("agent_steps", 0))
+    model.policy.set_training_mode(False)
+    return model

@@ -1,0 +1,140 @@
+"""Run folders: ``<logs>/<algo>/<env>_<i>/``, which hold all that a run needs to be repeated."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import IO, Any
+
+from sb3_roles._version import __version__
+from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
+from sb3_roles.zoo.environments import folder_name
+from sb3_roles.zoo.options import UsageError
+
+ARGS_FILE, COMMAND_FILE, LOCK_FILE = "args.yml", "command.txt", "lock"
+CHECKPOINTS, BEST, BEST_FILE = "checkpoints", "best", "model.ckpt"
+_PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "numpy", "numba", "gymnasium")
+
+
+def _numbered(folder: Path, env: str) -> dict[int, Path]:
+    pattern = re.compile(re.escape(folder_name(env)) + r"_([0-9]+)")
+    found = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        match = pattern.fullmatch(path.name)
+        if match and path.is_dir():
+            found[int(match[1])] = path
+    return found
+
+
+def new_run(logs: Path, algo: str, env: str) -> Path:
+    """Make the next run folder.
+
+    :param logs: folder of all runs
+    :param algo: name of the algorithm
+    :param env: name of the environment
+    :return: the folder, empty
+    """
+    folder = logs / algo
+    folder.mkdir(parents=True, exist_ok=True)
+    number = max(_numbered(folder, env), default=0) + 1
+    while True:
+        path = folder / f"{folder_name(env)}_{number}"
+        try:
+            path.mkdir()
+            return path
+        except FileExistsError:
+            # Another trainer was faster.
+            number += 1
+
+
+class RunLock:
+    """Keeps two trainers from writing to one run; released by the system when its owner dies.
+
+    :param run: the run folder
+    :raises UsageError: if another process has it
+    """
+
+    def __init__(self, run: Path) -> None:
+        self._file: IO[str] = open(run / LOCK_FILE, "a+", encoding="utf-8")  # noqa: SIM115
+        try:
+            import fcntl
+        except ImportError:
+            return  # No such locks on this system.
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.seek(0)
+            owner = self._file.read(32).strip() or "unknown"
+            self._file.close()
+            raise UsageError(f"{run}: process {owner} is training this run") from None
+        self._file.truncate(0)
+        self._file.write(f"{os.getpid()}\n")
+        self._file.flush()
+
+    def release(self) -> None:
+        """Let others train this run."""
+        self._file.close()
+
+
+def write_description(
+    run: Path, config: Mapping[str, Any], args: Mapping[str, Any], command: Sequence[str]
+) -> None:
+    """Write what a run is: ``config.yml``, ``args.yml`` and ``command.txt``.
+
+    :param run: the run folder
+    :param config: the whole configuration
+    :param args: the command line's options, as they were understood
+    :param command: the command line
+    """
+    write_yaml(run / CONFIG_FILE, config)
+    write_yaml(run / ARGS_FILE, args)
+    note_command(run, command)
+
+
+def note_command(run: Path, command: Sequence[str]) -> None:
+    """Add a command line to ``command.txt``, with the versions that it ran with.
+
+    :param run: the run folder
+    :param command: the command line
+    """
+    lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {_commit()}"]
+    lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
+    with open(run / COMMAND_FILE, "a", encoding="utf-8") as file:
+        file.write("\n".join(lines) + "\n")
+
+
+def _versions() -> list[str]:
+    found = []
+    for name in _PACKAGES:
+        try:
+            found.append(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            found.append(f"{name} unknown")
+    return found
+
+
+def _commit() -> str:
+    """Return the commit of the source tree, with a mark if it was changed."""
+    here = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        result = subprocess.run(
+            ["git", "-C", str(here), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+        return result.stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + (" with changes" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
