@@ -23,7 +23,7 @@ from toy_envs import PlainEnv
 from sb3_roles import HMAPPO, MAPPO, RoleWrapper, TeamWrapper
 from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.team_vec_env import make_team_vec_env
-from sb3_roles.common.torch_layers import NORM_LAYERS, has_fast_bfloat16
+from sb3_roles.common.torch_layers import NORM_LAYERS, FrozenBatchNorm2d, has_fast_bfloat16
 from sb3_roles.hmappo import RoleActorCriticPolicy
 
 OURS = {"mappo": (MAPPO, "TeamPolicy", SMALL_TEAM), "hmappo": (HMAPPO, "RolePolicy", SMALL_ROLE)}
@@ -69,12 +69,21 @@ def deviations(model):
             now = model.policy.streams(batch.observations, batch.actions)
         for new, old in zip(now.log_probs, batch.old_log_probs, strict=True):
             largest = max(largest, float((new - old).clamp(min=-1e3).abs().max()))
-    before = weights(model)
+    before = {name: value.clone() for name, value in model.policy.named_parameters()}
     model.train()
-    assert same(before, weights(model))
+    assert same(before, dict(model.policy.named_parameters()))
     n_minibatches = len(list(model.rollout_buffer.minibatches(model.batch_size)))
-    assert len(reports) == len(model.policy.stream_names) * n_minibatches * model.n_epochs > 8
+    assert n_minibatches > 2
+    assert len(reports) == len(model.policy.stream_names) * n_minibatches * model.n_epochs
     return largest, reports
+
+
+def check_no_deviation(model):
+    largest, reports = deviations(model)
+    assert largest < 1e-5
+    assert all(float(report.clip_fraction) == 0.0 for report in reports)
+    assert max(abs(float(report.kl)) for report in reports) < 1e-7
+    assert max(float(report.entropy) for report in reports) > 0.1
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -83,31 +92,53 @@ def deviations(model):
 def test_with_learning_rate_0_nothing_diverges(kind, norm_layer, role_every):
     roles = {"role_every": role_every} if kind == "hmappo" else None
     env = small_search(sub_goal="nearest", roles=roles)
-    model = make_model(kind, env, {"norm_layer": norm_layer}, learning_rate=0.0)
-    largest, reports = deviations(model)
-    assert largest < 1e-5
-    assert all(float(report.clip_fraction) == 0.0 for report in reports)
-    assert max(abs(float(report.kl)) for report in reports) < 1e-7
-    assert min(float(report.entropy) for report in reports[1:]) > 0.0
+    policy = {"norm_layer": norm_layer}
+    check_no_deviation(make_model(kind, env, policy, learning_rate=0.0, batch_size=6))
 
 
 @pytest.mark.skipif(not has_fast_bfloat16(), reason="no bfloat16 in this CPU's hardware")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("norm_layer", NORM_LAYERS)
 def test_with_learning_rate_0_nothing_diverges_in_bf16(kind, norm_layer):
-    model = make_model(
-        kind, policy={"norm_layer": norm_layer, "precision": "bf16"}, learning_rate=0.0
-    )
-    largest, reports = deviations(model)
-    assert largest < 0.03
-    assert all(float(report.clip_fraction) == 0.0 for report in reports)
-    assert max(abs(float(report.kl)) for report in reports) < 1e-4
+    env = small_search(height=25, width=25, roles={} if kind == "hmappo" else None)
+    policy = {"norm_layer": norm_layer, "precision": "bf16"}
+    check_no_deviation(make_model(kind, env, policy, learning_rate=0.0, batch_size=6))
+
+
+@pytest.mark.skipif(not has_fast_bfloat16(), reason="no bfloat16 in this CPU's hardware")
+def test_bf16_learns_on_small_maps():
+    model = make_model(policy={"precision": "bf16"}, sharp=False)
+    model.learn(3 * 10 * model.n_envs)
 
 
 def test_normalization_with_statistics_learns_on_one_team():
     env = small_search(n_teams=1, roles={})
     model = make_model(env=env, policy={"norm_layer": "frozen_batch"})
     model.learn(2 * 10 * env.num_envs)
+
+
+def test_statistics_see_more_of_an_episode_than_its_start():
+    # The usual setting, and the default for area search: a rollout is as long as an episode.
+    env = small_search(n_teams=4, horizon=10, roles={})
+    model = make_model(env=env, policy={"norm_layer": "frozen_batch"}, n_steps=10)
+    starts = set()
+    seen = []
+    streams = model.policy.streams
+    layers = [m for m in model.policy.modules() if isinstance(m, FrozenBatchNorm2d)]
+
+    def recorded(obs, *args, **kwargs):
+        if layers[0].training:
+            seen.append(obs["joint"].clone())
+        return streams(obs, *args, **kwargs)
+
+    model.policy.streams = recorded
+    for _ in range(3):
+        starts.add(env.team_env.batched.observations["joint"].tobytes())
+        collect(model)
+        model.train()
+    assert layers and seen
+    maps = {one.numpy().tobytes() for batch in seen for one in batch}
+    assert len(maps) > 4 * len(starts), "all statistics are those of first observations"
 
 
 # Learning
@@ -181,13 +212,13 @@ def test_hmappo_learns_which_role_makes_the_right_move_pay():
     policy = {"primitive_keys": ["blank"], "share_encoders": True}
     model = make_model("hmappo", env, policy, **LEARNING)
     before = success(model, env)
-    model.learn(16 * env.num_envs * 60)
+    model.learn(16 * env.num_envs * 12)
     assert before < 0.6
     assert success(model, env) > 0.95
     # One role for ever can be right for one of two signals only.
     fixed = RoleWrapper(make_team_vec_env(SignalEnv, 8, 0), role_control="cover")
     model = make_model("hmappo", fixed, policy, **LEARNING)
-    model.learn(16 * env.num_envs * 60)
+    model.learn(16 * env.num_envs * 12)
     assert success(model, fixed) < 0.6
 
 
@@ -195,7 +226,7 @@ def test_hmappo_learns_which_role_makes_the_right_move_pay():
 def test_mappo_learns_what_only_a_team_mate_sees_through_the_graph(graph):
     env = make_team_vec_env(lambda: SignalEnv(mate=True), 8, 0)
     model = make_model("mappo", env, {"graph": graph}, **LEARNING)
-    model.learn(16 * env.num_envs * 60)
+    model.learn(16 * env.num_envs * 12)
     env = TeamWrapper(env)
     if graph:
         assert success(model, env) > 0.95
@@ -415,9 +446,9 @@ def test_every_algorithm_trains_everywhere(algorithm, env_name):
             **options,
         )
     before = weights(model)
-    model.learn(3 * 10 * env.num_envs)
+    model.learn(2 * 10 * env.num_envs)
     after = weights(model)
-    assert model.num_timesteps == 3 * 10 * env.num_envs
+    assert model.num_timesteps == 2 * 10 * env.num_envs
     assert all(th.isfinite(value).all() for value in after.values())
     moved = {name for name in after if not th.equal(before[name], after[name])}
     # What only the primitive critic owns is not part of stock algorithms.
@@ -537,10 +568,11 @@ class PoisonedWrapper(RoleWrapper):
         return result
 
 
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("normalize", [True, False])
-def test_a_reward_that_is_not_a_number_stops_before_the_weights_change(normalize):
+def test_a_reward_that_is_not_a_number_stops_before_the_weights_change(normalize, seed):
     env = PoisonedWrapper(make_team_vec_env(PlainEnv, 3, 0))
-    model = make_model(env=env, batch_size=2, normalize_advantage=normalize)
+    model = make_model(env=env, batch_size=2, normalize_advantage=normalize, seed=seed)
     before = weights(model)
     with pytest.raises((ValueError, FloatingPointError)) as caught:
         model.learn(10 * env.num_envs)

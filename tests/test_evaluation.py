@@ -230,9 +230,8 @@ def tiny_policy(sub_goal="assigned", algo=HMAPPO, scene=TINY, **wrapper):
     if algo is MAPPO:
         return MAPPO("TeamPolicy", TeamWrapper(venv), **options)
     model = HMAPPO("RolePolicy", RoleWrapper(venv, **wrapper), **options)
-    for name in ("role_net", "action_net"):
-        for parameter in getattr(model.policy, name).out.parameters():
-            parameter.data *= 100
+    for layer in (model.policy.role_net.out, model.policy.action_net.head.out):
+        layer.weight.data *= 100
     return model
 
 

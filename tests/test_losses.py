@@ -184,7 +184,7 @@ def test_the_surrogate_is_clipped_where_the_policy_has_gone_far_enough(
     old = th.tensor([[0.4, 0.6]], dtype=th.float64).log()
     new = th.tensor([[0.4 * ratio, 1 - 0.4 * ratio]], dtype=th.float64).log().requires_grad_()
     part = evaluate(new, old, [0], [advantage])
-    assert float(part.loss.detach()) == pytest.approx(-surrogate, rel=1e-12)
+    assert part.loss.item() == pytest.approx(-surrogate, rel=1e-12)
     assert float(part.clip_fraction) == float(abs(ratio - 1) > 0.2)
     part.loss.backward()
     slope = -advantage * ratio if pushes else 0.0
@@ -270,7 +270,7 @@ def test_a_minibatch_without_any_decision_has_no_policy_gradient():
     )
     part.loss.backward()
     assert (new.grad == 0).all()
-    assert [float(x) for x in (part.loss, part.entropy, part.kl)] == [0.0, 0.0, 0.0]
+    assert [x.item() for x in (part.loss, part.entropy, part.kl)] == [0.0, 0.0, 0.0]
 
 
 def test_the_kl_coefficient_follows_the_divergence():

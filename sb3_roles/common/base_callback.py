@@ -69,7 +69,7 @@ class TeamCallback(BaseCallback):
 
     def _begun(self) -> np.ndarray:
         """Bool (n_teams,): which teams have not made a step in their episode yet."""
-        starts = self.model._last_episode_starts  # type: ignore[attr-defined]
+        starts = self.model._last_episode_starts
         return np.asarray(starts, np.bool_)[:: self.n_agents]
 
     def _ended(self) -> np.ndarray:

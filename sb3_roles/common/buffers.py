@@ -92,6 +92,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 "in TeamWrapper or RoleWrapper"
             )
         self._stores: dict[str, _MapStore] = {}
+        self._layout: tuple[Any, ...] = ()
         super().__init__(
             buffer_size,
             observation_space,
@@ -108,11 +109,20 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self.full = False
         self.generator_ready = False
 
+    def _allocate_for(self, observations: Mapping[str, th.Tensor], chosen: Streams) -> None:
+        """Allocate, unless the last rollout had the same shapes: the teams may have changed."""
+        n_agents = int(observations[AGENT_KEY][0, 1])
+        shapes = {key: (value.shape, value.dtype) for key, value in observations.items()}
+        layout = (self.n_envs, n_agents, chosen.actions.shape[1], shapes)
+        if layout != self._layout:
+            self._layout = layout
+            self.n_agents, self.n_teams = n_agents, self.n_envs // n_agents
+            self._allocate(observations, chosen)
+
     def _allocate(self, observations: Mapping[str, th.Tensor], chosen: Streams) -> None:
-        self.n_agents = int(observations[AGENT_KEY][0, 1])
-        self.n_teams = self.n_envs // self.n_agents
-        for key, value in observations.items():
-            self._stores[key] = _MapStore(self.buffer_size, value)
+        self._stores = {
+            key: _MapStore(self.buffer_size, value) for key, value in observations.items()
+        }
         n_streams = chosen.actions.shape[1]
 
         def rows(*shape: int, dtype: th.dtype = th.float32) -> th.Tensor:
@@ -145,8 +155,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param rewards: float (n, S); with the value at a truncation already added
         :param ends: bool (n,), whether the episode ended with this step
         """
-        if not self._stores:
-            self._allocate(observations, chosen)
+        if self.pos == 0:
+            self._allocate_for(observations, chosen)
         t = self.pos
         for key, store in self._stores.items():
             store.put(t, observations[key])
@@ -175,6 +185,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param gae_lambda: float (S,)
         :param normalize_advantage: to mean 0 and deviation 1 over the rows in which a stream
             decided, per stream
+        :raises FloatingPointError: if a return is not finite
         """
         self._returns = lambda_returns(
             self._rewards,
@@ -184,6 +195,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             gamma,
             gae_lambda,
         )
+        if not th.isfinite(self._returns).all():
+            raise FloatingPointError(
+                "a return is not finite: check the environment's rewards and the critics' values; "
+                "nothing was learned from this rollout"
+            )
         self._advantages = self._returns - self._values
         if normalize_advantage:
             for s in range(self._advantages.shape[2]):
@@ -224,6 +240,15 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 self._take(self._active, index),
             )
 
+    def spread_observations(self, most_teams: int) -> dict[str, th.Tensor]:
+        """Take observations that are spread evenly over the rollout, without random numbers.
+
+        :param most_teams: (time, team) pairs to take at most
+        :return: tensors by key, rows of whole teams
+        """
+        n = self.buffer_size * self.n_teams
+        return self._observations_at(th.arange(0, n, -(-n // most_teams), device=self.device))
+
     # The interface of Stable-Baselines3's buffers
 
     def add(  # type: ignore[override]
@@ -242,8 +267,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         flat = th.as_tensor(action, device=self.device).view(self.n_envs, -1).long()
         column = value.detach().view(-1, 1)
         chosen = Streams(flat, (), column, column, th.ones_like(flat, dtype=th.bool))
-        if not self._stores:
-            self._allocate(tensors, chosen)
+        if self.pos == 0:
+            self._allocate_for(tensors, chosen)
             self._rewards, self._values = self._rewards[..., :1], self._values[..., :1]
             self._expected_values = self._expected_values[..., :1]
         if self.pos:

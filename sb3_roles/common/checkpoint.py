@@ -140,16 +140,17 @@ def write_checkpoint(
             for name, data in members.items()
         },
     }
+    members = {MANIFEST: json.dumps(facts, indent=1).encode(), **members}
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
             with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                for name, data in {MANIFEST: json.dumps(facts, indent=1).encode(), **members}.items():
+                for name, data in members.items():
                     # A fixed date: equal states make equal files.
                     archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
             file.flush()
             os.fsync(file.fileno())
-        if _read_members(temporary) != members:
+        if _read(temporary)[1] != {name: members[name] for name in members if name != MANIFEST}:
             raise CheckpointError(f"{path}: reads back differently from what was written")
         os.replace(temporary, path)
     finally:
@@ -170,10 +171,6 @@ def _on_cpu(tensors: Mapping[str, th.Tensor]) -> dict[str, th.Tensor]:
     return {
         name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()
     }
-
-
-def _read_members(path: Path) -> dict[str, bytes]:
-    return _read(path)[1]
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:

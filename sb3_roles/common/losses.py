@@ -11,6 +11,8 @@ from sb3_roles.common.distributions import entropy, kl_divergence, pick
 
 # RLlib's rule for its KL penalty, which the paper trained with.
 _KL_HIGH, _KL_LOW, _KL_UP, _KL_DOWN = 2.0, 0.5, 1.5, 0.5
+# Our bounds on it: without, a long calm phase would switch the penalty off for good.
+_KL_COEF_MIN, _KL_COEF_MAX = 1.0e-4, 1.0e2
 
 
 def lambda_returns(
@@ -104,7 +106,7 @@ def adapt_kl_coef(kl_coef: float, kl: float, kl_target: float) -> float:
     :return: the next coefficient
     """
     if kl > _KL_HIGH * kl_target:
-        return kl_coef * _KL_UP
-    if kl < _KL_LOW * kl_target:
-        return kl_coef * _KL_DOWN
-    return kl_coef
+        kl_coef *= _KL_UP
+    elif kl < _KL_LOW * kl_target:
+        kl_coef *= _KL_DOWN
+    return min(max(kl_coef, _KL_COEF_MIN), _KL_COEF_MAX)

@@ -18,6 +18,7 @@ from sb3_roles.common.names import closest
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY
 from sb3_roles.common.team_wrapper import AGENT_KEY
 from sb3_roles.common.torch_layers import (
+    NORM_LAYERS,
     Head,
     MapEncoder,
     PatchEncoder,
@@ -142,8 +143,19 @@ class TeamPolicy(ActorCriticPolicy):
                     raise ValueError(closest("observation key", key, readable))
         if STATE_KEY in (actor_keys or ()):
             raise ValueError("actors never read 'state': they must act without it (CTDE)")
-        self.actor_keys = tuple(actor_keys or own)
-        self.critic_keys = tuple(critic_keys or readable)
+        self.actor_keys = tuple(own if actor_keys is None else actor_keys)
+        self.critic_keys = tuple(readable if critic_keys is None else critic_keys)
+        if not self.actor_keys or not self.critic_keys:
+            raise ValueError(
+                f"actors and critics must read at least one key each, of {readable}; 'state' is "
+                "for critics only"
+            )
+        if norm_layer not in NORM_LAYERS:
+            raise ValueError(closest("norm_layer", norm_layer, NORM_LAYERS))
+        if communication_radius is not None and not communication_radius >= 0:
+            raise ValueError(
+                f"communication_radius must be at least 0 or None, got {communication_radius!r}"
+            )
         self.share_encoders = share_encoders
         self.norm_layer = norm_layer
         self.graph = graph
@@ -263,10 +275,10 @@ class TeamPolicy(ActorCriticPolicy):
             name = self._encoder_name(owner, key)
             if len(self.observation_space[key].shape or ()) == 3:
                 if name not in memo:
-                    memo[name] = self.encoders[name](value)
+                    memo[name] = self.encoders[name](self._scaled(key, value))
                 part = memo[name]
             else:
-                part = value.flatten(1).float()
+                part = value.reshape(len(value), -1).float()
                 space = self.observation_space[key]
                 if isinstance(space, spaces.Box) and not np.isfinite(space.high).all():
                     part = symlog(part)
@@ -274,6 +286,13 @@ class TeamPolicy(ActorCriticPolicy):
                 part = part.repeat_interleave(rows // part.shape[0], dim=0)
             parts.append(part)
         return th.cat(parts, dim=1)
+
+    def _scaled(self, key: str, maps: th.Tensor) -> th.Tensor:
+        """Bring images to [0, 1]; maps of 0 and 1 stay the bytes that they are."""
+        space = self.observation_space[key]
+        assert isinstance(space, spaces.Box)
+        high = float(space.high.max())
+        return maps / high if space.dtype == np.uint8 and high > 1.0 else maps
 
     def _uses_bf16(self) -> bool:
         return resolve_precision(self.precision, self.device) == "bf16"

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from sb3_roles.common import roles as role_registry
 from sb3_roles.common.names import closest
 from sb3_roles.common.roles import Role, get_roles, weight_vector
+from sb3_roles.common.team_vec_env import team_seeds
 from sb3_roles.common.team_wrapper import TeamWrapper
 
 ROLE_KEY = "role"
@@ -42,8 +43,8 @@ class RoleWrapper(TeamWrapper):
         in its role (``"same_role"``, the paper), or of the whole ``"team"``
     :param role_every: steps that a role lasts
     :param role_control: ``"learned"``, ``"random"`` (uniform, every ``role_every`` steps) or the
-        name of the role that all robots act in
-    :param seed: seed of the random roles
+        name of the role that all robots act in. Random roles are a function of the seed of
+        ``seed()``, the team, and the numbers of episode and step
     :raises ValueError: if an option is unknown or out of range, or the actions are not discrete
     """
 
@@ -56,7 +57,6 @@ class RoleWrapper(TeamWrapper):
         reward_sharing: str = "own",
         role_every: int = 1,
         role_control: str = "learned",
-        seed: int = 0,
     ) -> None:
         self.roles = get_roles(roles)
         self.role_names = tuple(role.name for role in self.roles)
@@ -67,9 +67,9 @@ class RoleWrapper(TeamWrapper):
         controls = ("learned", "random", *self.role_names)
         if role_control not in controls:
             raise ValueError(closest("role_control", role_control, controls))
-        super().__init__(venv)
         if not isinstance(venv.action_space, spaces.Discrete):
             raise ValueError(f"roles need discrete actions, got {venv.action_space}")
+        super().__init__(venv)
         self.action_space = spaces.MultiDiscrete([len(self.roles), int(venv.action_space.n)])
         # An environment without components has one: its reward, which every role is paid.
         self.components = self.team_env.component_names or ("reward",)
@@ -83,7 +83,8 @@ class RoleWrapper(TeamWrapper):
         self.reward_sharing = reward_sharing
         self.role_every = role_every
         self.role_control = role_control
-        self._rng = np.random.default_rng(seed)
+        self._role_seeds = np.array(team_seeds(0, self.n_teams), np.uint64)
+        self._episodes = np.zeros(self.n_teams, np.uint64)
         self.current_roles = np.full(self.num_envs, -1, np.int64)
         self._episode_steps = np.zeros(self.num_envs, np.int64)
         self.stream_rewards = np.zeros((self.num_envs, len(STREAMS)), np.float32)
@@ -109,11 +110,35 @@ class RoleWrapper(TeamWrapper):
         if self.role_control == "learned":
             return
         if self.role_control == "random":
-            drawn = self._rng.integers(len(self.roles), size=self.num_envs)
             due = self._episode_steps % self.role_every == 0
-            self.current_roles = np.where(due, drawn, self.current_roles)
+            self.current_roles = np.where(due, self._random_roles(), self.current_roles)
         else:
             self.current_roles[:] = self.role_names.index(self.role_control)
+
+    def _random_roles(self) -> np.ndarray:
+        """Roles of the coming step, hashed from (seed of the team, episode, step, robot)."""
+        seeds = np.repeat(self._role_seeds, self.n_agents)
+        episodes = np.repeat(self._episodes, self.n_agents)
+        robots = np.tile(np.arange(self.n_agents, dtype=np.uint64), self.n_teams)
+        word = seeds
+        for part in (episodes, self._episode_steps.astype(np.uint64), robots):
+            # SplitMix64's scrambling, after each part.
+            word = word + (part + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+            word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            word = word ^ (word >> np.uint64(31))
+        return (word % np.uint64(len(self.roles))).astype(np.int64)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seeds of the environments, and of random roles, for the next ``reset()``.
+
+        :param seed: the seed of the whole set, None for fresh entropy
+        :return: the team's seed for each row
+        """
+        per_row = self.venv.seed(seed)
+        self._role_seeds = np.array(per_row[:: self.n_agents], np.uint64)
+        self._episodes[:] = 0
+        return per_row
 
     def reset(self) -> dict[str, np.ndarray]:
         """Start new episodes, without a role yet.
@@ -121,6 +146,7 @@ class RoleWrapper(TeamWrapper):
         :return: observations, rows (n_teams * n_agents, ...)
         """
         self.current_roles = np.full(self.num_envs, -1, np.int64)
+        self._episodes += np.uint64(1)
         self._episode_steps[:] = 0
         self.stream_rewards = np.zeros_like(self.stream_rewards)
         observations = self.venv.reset()
@@ -140,6 +166,12 @@ class RoleWrapper(TeamWrapper):
                 f"row, got {actions.shape}"
             )
         roles = actions[:, 0].astype(np.int64)
+        if roles.min() < 0 or roles.max() >= len(self.roles):
+            wrong = roles[(roles < 0) | (roles >= len(self.roles))][0]
+            raise ValueError(
+                f"roles must be in 0..{len(self.roles) - 1} ({', '.join(self.role_names)}), "
+                f"got {wrong}"
+            )
         held = self._extra_observations()[ROLE_DUE_KEY][:, 0] == 0
         if np.any(held & (roles != self.current_roles)):
             row = int(np.flatnonzero(held & (roles != self.current_roles))[0])
@@ -167,6 +199,7 @@ class RoleWrapper(TeamWrapper):
         self._episode_steps += 1
         self._extend_terminal(infos)
         self._episode_steps[dones] = 0
+        self._episodes[dones[:: self.n_agents]] += np.uint64(1)
         self.current_roles = np.where(dones, -1, self.current_roles)
         self._control_roles()
         return self._extend(observations), self.stream_rewards[:, 0].copy(), dones, infos
@@ -194,11 +227,13 @@ class RoleWrapper(TeamWrapper):
         return {
             "current_roles": self.current_roles.copy(),
             "episode_steps": self._episode_steps.copy(),
-            "generator": self._rng.bit_generator.state,
+            "episodes": self._episodes.copy(),
+            "role_seeds": self._role_seeds.copy(),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from what :meth:`get_state` returned."""
         self.current_roles = np.array(state["current_roles"], np.int64)
         self._episode_steps[:] = state["episode_steps"]
-        self._rng.bit_generator.state = state["generator"]
+        self._episodes[:] = state["episodes"]
+        self._role_seeds[:] = state["role_seeds"]

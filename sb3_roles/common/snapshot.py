@@ -81,8 +81,8 @@ def env_gap(env: VecEnv) -> str | None:
         except AttributeError:
             owners = [None]
         if not callable(owners[0]):
-            layers = team_env.get_attr("metadata", indices=0)[0] or {}
-            return f"environment {layers.get('name', 'of this run')} offers no {method}"
+            metadata = team_env.metadata or {}
+            return f"environment {metadata.get('name', 'of this run')} offers no {method}"
     return None
 
 
@@ -286,7 +286,7 @@ def _set_observations(model: OnPolicyAlgorithm, state: Mapping[str, Any]) -> Non
         # Laid out like the environment's: convolutions choose their kernel by it.
         restored[key] = np.empty_like(template)
         np.copyto(restored[key], saved[key])
-    model._last_obs = restored if is_dict else restored[""]  # type: ignore[assignment]
+    model._last_obs = restored if is_dict else restored[""]
     model._last_episode_starts = np.array(state["last_episode_starts"])
 
 

@@ -48,6 +48,12 @@ class TeamWrapper(VecEnvWrapper):
         self._is_dict = isinstance(space, spaces.Dict)
         boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
         # Unbounded: a saved policy must serve teams of any size.
+        taken = [key for key in (AGENT_KEY, *self._extra_spaces()) if key in boxes]
+        if taken:
+            raise ValueError(
+                f"the environment's observation has a key {taken[0]!r}, which the wrapper adds: "
+                "rename it"
+            )
         boxes[AGENT_KEY] = spaces.Box(0.0, np.inf, (2,), np.float32)
         boxes.update(self._extra_spaces())
         super().__init__(venv, observation_space=spaces.Dict(boxes))

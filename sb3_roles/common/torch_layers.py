@@ -22,7 +22,9 @@ _STYLES: dict[str, tuple[tuple[tuple[int, int, int], ...], bool, int]] = {
     "state": (((4, 2, 1), (4, 2, 1), (4, 2, 1)), False, 2),
 }
 CHANNELS = {"local": (8, 16, 32), "joint": (16, 32, 64, 64), "state": (8, 16, 32)}
-_MIN_SIDE = {"local": 3, "joint": 5, "state": 8}
+# Smaller maps are padded: each convolution then has at least 2 x 2 cells to read. (On 1 x 1 cells,
+# PyTorch's bfloat16 convolution on CPUs returns weight gradients of uninitialized memory.)
+_MIN_SIDE = {"local": 6, "joint": 19, "state": 8}
 
 
 class FrozenBatchNorm2d(nn.BatchNorm2d):
@@ -35,6 +37,12 @@ class FrozenBatchNorm2d(nn.BatchNorm2d):
     def train(self, mode: bool = True) -> FrozenBatchNorm2d:
         """Stay in evaluation mode, whatever the policy does."""
         return super().train(False)
+
+    def forward(self, maps: th.Tensor) -> th.Tensor:
+        """Normalize; a single value per channel has no statistics and changes none."""
+        if self.training and maps.numel() // maps.shape[1] < 2:
+            nn.BatchNorm2d.train(self, False)
+        return super().forward(maps)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numba import njit
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import BasePolicy
 
 from area_search import paths
@@ -135,7 +136,7 @@ class PolicyController:
             want = known[key].shape or ()  # type: ignore[index]
             have = batch.observation_space[key].shape or ()
             # Maps of any size can be encoded.
-            if want != have and not (len(want) == len(have) == 3 and want[0] == have[0]):
+            if want != have and not (len(want) == len(have) == 3 and want[:1] == have[:1]):
                 raise ValueError(f"the policy was trained with {key!r} of shape {want}, not {have}")
         self.batch = batch
         self._uniforms = np.zeros((batch.n_teams, batch.n_agents, _N_UNIFORMS))
@@ -209,7 +210,7 @@ class PolicyController:
             options["action_masks"] = self._masks(rows)
         try:
             actions, self._state = self.policy.predict(
-                rows["observation"]  # type: ignore[arg-type]
+                rows["observation"]
                 if known is None
                 else {key: rows[key] for key in known if key in rows},
                 self._state,
@@ -255,7 +256,8 @@ class PolicyController:
             if training:
                 policy.set_training_mode(True)
         if not isinstance(distribution, RoleDistribution):
-            logits = distribution.distribution.logits  # type: ignore[attr-defined]
+            assert isinstance(distribution, CategoricalDistribution)
+            logits = distribution.distribution.logits
             moves = self._pick(logits, uniforms[:, 1])
             return moves, moves
         roles = self._pick(distribution.role_log_probs, uniforms[:, 0])

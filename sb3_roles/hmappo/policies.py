@@ -102,7 +102,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         }
 
     def _build_networks(self) -> None:
-        keys = self.primitive_keys or self.actor_keys
+        keys = self.actor_keys if self.primitive_keys is None else self.primitive_keys
         for key in keys:
             if key not in self.actor_keys:
                 raise ValueError(closest("key in primitive_keys", key, self.actor_keys))

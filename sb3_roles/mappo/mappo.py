@@ -134,7 +134,8 @@ class MAPPO(OnPolicyAlgorithm):
         _check_unit(gamma=gamma, gae_lambda=gae_lambda)
         _check_not_negative(vf_coef=vf_coef, kl_coef=kl_coef, kl_target=kl_target)
         for name, value in (("max_grad_norm", max_grad_norm), ("target_kl", target_kl)):
-            if value is not None and not value > 0:
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if value is not None and not (number and value > 0):
                 raise ValueError(f"{name} must be a number above 0 or None, got {value!r}")
         for name, schedule in (
             ("learning_rate", learning_rate),
@@ -203,9 +204,6 @@ class MAPPO(OnPolicyAlgorithm):
         assert isinstance(rollout_buffer, TeamRolloutBuffer)
         assert self._last_obs is not None, "no previous observation was provided"
         self.policy.set_training_mode(False)
-        with updating_statistics(self.policy) as has_statistics, th.no_grad():
-            if has_statistics:
-                self.policy.streams(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
         rollout_buffer.reset()
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
@@ -219,7 +217,8 @@ class MAPPO(OnPolicyAlgorithm):
             if not callback.on_step():
                 return False
             self._update_info_buffer(infos, dones)
-            stream_rewards = th.as_tensor(self._stream_rewards(env, rewards)).to(self.device)
+            # A copy: the values at truncations are added to it.
+            stream_rewards = th.tensor(self._stream_rewards(env, rewards), device=self.device)
             self._bootstrap(stream_rewards, dones, infos)
             ends = th.as_tensor(dones).to(self.device)
             rollout_buffer.add_streams(obs, chosen, stream_rewards, ends)  # type: ignore[arg-type]
@@ -242,15 +241,18 @@ class MAPPO(OnPolicyAlgorithm):
         self, stream_rewards: th.Tensor, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
         """Add the value of the last observation to the last reward of truncated episodes."""
-        rows = [row for row in np.flatnonzero(dones) if infos[row].get("TimeLimit.truncated")]
-        if not rows:
+        truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
+        if not truncated.any():
             return
+        # Whole teams, which end together, even if only some of their robots were truncated.
+        rows = np.flatnonzero(dones)
         last = [infos[row]["terminal_observation"] for row in rows]
         stacked = {key: np.stack([one[key] for one in last]) for key in last[0]}
         with th.inference_mode():
             values = self.policy.streams(obs_as_tensor(stacked, self.device)).expected_values  # type: ignore[arg-type]
         gamma = th.tensor([s.gamma for s in self._settings()], device=self.device)
-        stream_rewards[th.as_tensor(rows, device=self.device)] += gamma * values
+        counts = th.as_tensor(truncated[rows], device=self.device).unsqueeze(1)
+        stream_rewards[th.as_tensor(rows, device=self.device)] += gamma * values * counts
 
     def train(self) -> None:
         """Update the policy on the rollout."""
@@ -288,16 +290,25 @@ class MAPPO(OnPolicyAlgorithm):
                 # L = L_p + L_r (Eq. 9)
                 self._optimize(th.stack([part.loss for part in losses]).sum())
                 n_steps += 1
+            self._n_updates += 1
             if stopped:
                 break
-            self._n_updates += 1
+        self._update_statistics()
         self._log_update(history, n_steps)
+
+    def _update_statistics(self) -> None:
+        """Let frozen normalization layers see the rollout, between an update and the next one."""
+        with updating_statistics(self.policy) as has_statistics, th.no_grad():
+            if has_statistics:
+                # Without gradients this many rows cost little.
+                obs = self.rollout_buffer.spread_observations(max(2, self.batch_size))
+                self.policy.streams(obs)
 
     def _optimize(self, loss: th.Tensor) -> None:
         """Take one step, unless it would destroy the weights."""
         if not th.isfinite(loss):
             raise FloatingPointError(
-                f"the loss is {float(loss)}: no step was taken; check rewards and observations, or "
+                f"the loss is {loss.item()}: no step was taken; check rewards and observations, or "
                 "lower learning_rate"
             )
         self.policy.optimizer.zero_grad(set_to_none=True)
@@ -306,7 +317,8 @@ class MAPPO(OnPolicyAlgorithm):
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), limit)
         if not th.isfinite(norm):
             raise FloatingPointError(
-                f"the gradient norm is {float(norm)}: no step was taken; lower learning_rate"
+                f"the gradient norm is {float(norm)}: no step was taken; lower learning_rate, or "
+                "try precision='fp32'"
             )
         self.policy.optimizer.step()
 

@@ -17,6 +17,7 @@ _TEAM_BUFFER = {"rollout_buffer_class": "sb3_roles.common.buffers:TeamRolloutBuf
 _ROLE_POLICY = {"RolePolicy": "sb3_roles.hmappo.policies:RoleActorCriticPolicy"}
 _WIDTHS = Items(Whole(1, 65536))
 _SOME_WIDTHS = Items(Whole(1, 65536), least=1)
+_CHANNELS = Items(Whole(1, 65536), optional=True, least=1)
 _KEYS = Items(optional=True, least=1)
 _COEFFICIENT = Number(0.0, 1e6)
 _RATE = Number(0.0, 10.0, schedule=True)
@@ -41,9 +42,10 @@ _TEAM_POLICY: dict[str, Range] = {
     "graph": Flag(),
     "graph_width": Whole(1, 65536),
     "communication_radius": Number(0.0, 1e6, optional=True),
-    "local_channels": _SOME_WIDTHS,
-    "joint_channels": _SOME_WIDTHS,
-    "state_channels": _SOME_WIDTHS,
+    "encoder": Choice(("convolutions", "patches")),
+    "local_channels": _CHANNELS,
+    "joint_channels": _CHANNELS,
+    "state_channels": _CHANNELS,
     "precision": Choice(("auto", "fp32", "bf16")),
     "optimizer_kwargs": _OPTIMIZER,
 }

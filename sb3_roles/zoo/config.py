@@ -93,7 +93,7 @@ def load_settings(algo: str, env: str, file: Path | None = None) -> dict[str, An
     if "n_timesteps" in content:
         settings = {key: value for key, value in content.items() if key not in _IDENTITY}
     elif env in content or DEFAULT in content:
-        settings = content.get(env, content.get(DEFAULT))
+        settings = content[env if env in content else DEFAULT]
     else:
         message = closest("environment", env, [*content, DEFAULT])
         raise ConfigError([f"{path}: {message}"])

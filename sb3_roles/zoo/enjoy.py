@@ -57,6 +57,30 @@ class LoadedRun:
             raise UsageError(f"{self.folder}: {error}") from error
 
 
+def find_run(logs: Path, algo: str, env: str, exp_id: int = 0) -> Path:
+    """Find a run folder, ``<logs>/<algo>/<env>_<id>``.
+
+    :param logs: folder of all runs
+    :param algo: name of the algorithm
+    :param env: name of the environment
+    :param exp_id: number of the run; 0 for the latest
+    :raises UsageError: if there is none
+    """
+    from sb3_roles.zoo.environments import folder_name
+
+    prefix = f"{folder_name(env)}_"
+    runs = {
+        int(path.name.removeprefix(prefix)): path
+        for path in (logs / algo).glob("*")
+        if path.name.startswith(prefix) and path.name.removeprefix(prefix).isdecimal()
+    }
+    if runs and exp_id in (0, *runs):
+        return runs[exp_id or max(runs)]
+    wanted = f"run {exp_id}" if exp_id else "run"
+    there = f"there are {', '.join(map(str, sorted(runs)))}" if runs else "there is none"
+    raise UsageError(f"no {wanted} of {algo} on {env} in {str(logs)!r}: {there}")
+
+
 def load_run(folder: Path, best: bool = False, device: str = "auto") -> LoadedRun:
     """Load the policy of a run folder.
 
@@ -154,7 +178,6 @@ def run(args: Namespace) -> int:
     """
     from sb3_roles.zoo.algorithms import get_algorithm
     from sb3_roles.zoo.config import CONFIG_FILE
-    from sb3_roles.zoo.run_folder import find_run
 
     try:
         get_algorithm(args.algo)

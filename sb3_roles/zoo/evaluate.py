@@ -10,7 +10,7 @@ from sb3_roles.baselines import CONTROLLER_NAMES, controller_class
 from sb3_roles.common.names import closest
 from sb3_roles.zoo.enjoy import add_play_options, load_run
 from sb3_roles.zoo.options import UsageError, scene_of
-from sb3_roles.zoo.simulate import add_episode_options, play
+from sb3_roles.zoo.simulate import add_episode_options, check_render, play
 
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
@@ -44,6 +44,7 @@ def run(args: Namespace) -> int:
     :raises UsageError: if the options do not describe a scene, or there is no such controller
     """
     scene = scene_of(args)
+    check_render(args.render)
     if args.controller in CONTROLLER_NAMES:
         return play(args, controller_class(args.controller)(), scene)
     folder = Path(args.controller)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 import warnings
 from collections.abc import Mapping
@@ -31,10 +32,16 @@ from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run
-from sb3_roles.zoo.models import make_env, make_model
+from sb3_roles.zoo.models import complete, make_env, make_model
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.run_folder import BEST_FILE, CHECKPOINTS
-from sb3_roles.zoo.train import open_run
+from sb3_roles.zoo.run_folder import (
+    BEST_FILE,
+    CHECKPOINTS,
+    RunLock,
+    new_run,
+    note_command,
+    write_description,
+)
 from sb3_roles.zoo.training import CsvLog, StopSignals, train
 
 # The periodic evaluation picks the best policy; the last one is on other episodes.
@@ -43,7 +50,7 @@ _MAX_EVAL_TEAMS = 8
 
 
 class TrainingFailed(Exception):
-    """Training can not go on, because a number is not finite; the message is one line."""
+    """Training can not go on, as when a loss is not finite; the message is one line."""
 
 
 def run_job(job: Mapping[str, Any]) -> int:
@@ -52,7 +59,7 @@ def run_job(job: Mapping[str, Any]) -> int:
     :param job: ``config``, ``options`` and ``resume``, plain data of ``zoo.train``
     :return: exit code: 0, or 130 or 143 after a signal
     :raises UsageError: if environment, configuration or checkpoint do not fit
-    :raises TrainingFailed: if a number is not finite
+    :raises TrainingFailed: if a loss or reward is not finite, or the environment misbehaves
     """
     config, options = job["config"], job["options"]
     if options["device"] == "cuda" and not th.cuda.is_available():
@@ -63,13 +70,32 @@ def run_job(job: Mapping[str, Any]) -> int:
     env = make_env(config)
     try:
         model = make_model(config, env, options["device"])
-        run, lock = open_run(job)
+        run, lock = _open_run(job)
         try:
             return _train_in(run, model, job)
         finally:
             lock.release()
     finally:
         env.close()
+
+
+def _open_run(job: Mapping[str, Any]) -> tuple[Path, RunLock]:
+    """Make, or find, the run folder of a job, and lock it."""
+    options = job["options"]
+    command = [Path(sys.argv[0]).name, *sys.argv[1:]]
+    if job["resume"] is not None:
+        path = Path(job["resume"])
+        lock = RunLock(path)
+        note_command(path, command)
+        return path, lock
+    config = job["config"]
+    path = new_run(Path(options["log_folder"]), config["algo"], config["env"])
+    lock = RunLock(path)
+    args = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
+    # A resumed run shall add in the same order, wherever it is resumed.
+    args["num_threads"] = th.get_num_threads()
+    write_description(path, complete(config), args, command)
+    return path, lock
 
 
 def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> int:
@@ -111,10 +137,13 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
                 log_interval=options["log_interval"],
                 progress_bar=options["progress"],
             )
-    except FloatingPointError as error:
-        raise TrainingFailed(f"{run}: {error}") from error
     except CheckpointError as error:
         raise UsageError(f"{run}: {error}") from error
+    except (FloatingPointError, ValueError) as error:
+        # Losses, rewards and observations that are not finite, teams that fall apart.
+        if options["verbose"] > 1:
+            raise
+        raise TrainingFailed(f"{run}: {' '.join(str(error).split())}") from error
     steps = model.num_timesteps // find_team_env(model.env).n_agents
     print(f"{run}: {steps} joint steps, {len(checkpoints.paths())} checkpoints", flush=True)
     if stop.received is not None:
@@ -152,8 +181,6 @@ def _read_newest(
 def _logger(
     run: Path, log: CsvLog, config: Mapping[str, Any], options: Mapping[str, Any]
 ) -> Logger:
-    import sys
-
     writers: list[KVWriter] = [log]
     if options["verbose"] and not options["progress"]:
         writers.append(HumanOutputFormat(sys.stdout))

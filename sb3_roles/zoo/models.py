@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,10 +17,11 @@ from sb3_roles.common.role_wrapper import RoleWrapper
 from sb3_roles.common.snapshot import load_weights
 from sb3_roles.common.team_vec_env import make_team_vec_env
 from sb3_roles.common.team_wrapper import TeamWrapper, find_team_env
-from sb3_roles.zoo.algorithms import get_algorithm
+from sb3_roles.zoo.algorithms import POLICY_ARGUMENTS, get_algorithm
 from sb3_roles.zoo.config import read_run_config
 from sb3_roles.zoo.environments import AREA_SEARCH, env_factory
 from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.ranges import Range
 from sb3_roles.zoo.run_folder import BEST, BEST_FILE, CHECKPOINTS
 
 
@@ -42,7 +44,7 @@ def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
         )
         if algorithm.wrapper == "team":
             return TeamWrapper(venv)
-        roles = RoleWrapper(venv, **config["wrapper_kwargs"], seed=config["seed"])
+        roles = RoleWrapper(venv, **config["wrapper_kwargs"])
     except (TypeError, ValueError) as error:
         raise UsageError(f"environment {config['env']}: {error}") from error
     if algorithm.whole_teams:
@@ -79,6 +81,51 @@ def make_model(
     except (TypeError, ValueError, RuntimeError) as error:
         raise UsageError(f"{config['algo']}: {error}") from error
     return model
+
+
+def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
+    """Return the named arguments of a constructor, those behind ``**options`` included.
+
+    :param cls: any class
+    """
+    found: dict[str, inspect.Parameter] = {}
+    for base in cls.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        own = inspect.signature(vars(base)["__init__"]).parameters
+        for one in own.values():
+            if one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL):
+                found.setdefault(one.name, one)
+        if not any(one.kind is one.VAR_KEYWORD for one in own.values()):
+            break
+    del found["self"]
+    return found
+
+
+def complete(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Add what a configuration leaves to the defaults, so that it outlives a change of them.
+
+    :param config: checked
+    :return: the whole configuration, plain data
+    """
+    algorithm = get_algorithm(config["algo"])
+    completed = dict(config)
+    ranges = {key: one for key, one in algorithm.parameters.items() if key != "batch_size"}
+    completed.update(_defaults(algorithm.load(), ranges, config))
+    policy, given = algorithm.policy(config["policy"]), config["policy_kwargs"]
+    ranges = POLICY_ARGUMENTS[config["policy"]]
+    completed["policy_kwargs"] = {**given, **_defaults(policy, ranges, given)}
+    return completed
+
+
+def _defaults(cls: type, ranges: Mapping[str, Range], given: Mapping[str, Any]) -> dict[str, Any]:
+    defaults = {}
+    for name, parameter in constructor_parameters(cls).items():
+        value = parameter.default
+        value = list(value) if isinstance(value, tuple) else value
+        if name in ranges and name not in given and ranges[name].problem(value) is None:
+            defaults[name] = value
+    return defaults
 
 
 def load_model(run: str | Path, best: bool = False, device: str = "auto") -> OnPolicyAlgorithm:

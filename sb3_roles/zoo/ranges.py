@@ -34,7 +34,7 @@ def yaml_number(text: str) -> str | None:
 
 
 def schedule_start(value: str) -> float | None:
-    """Return the first value of a schedule that is written as ``lin_5.0e-4``; None for other text."""
+    """Return the first value of a schedule such as ``lin_5.0e-4``; None for other text."""
     if not value.startswith(LINEAR):
         return None
     try:

@@ -177,7 +177,7 @@ class MaskWrapper(OwnViewWrapper):
     ) -> list[Any]:
         """Call a method of the environments; ``action_masks`` gives bool (n_roles + n_moves,)."""
         if method_name == "action_masks":
-            return list(self.masks[self.venv.unwrapped._get_indices(indices)].copy())
+            return list(self.masks[list(self.unwrapped._get_indices(indices))])
         return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
     def get_state(self) -> dict[str, Any]:

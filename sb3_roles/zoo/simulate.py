@@ -98,7 +98,7 @@ def run(args: Namespace) -> int:
     """
     scene = scene_of(args)
     # Numba takes its time to import: not before the arguments are known to be right.
-    _check_render(args.render)
+    check_render(args.render)
     return play(args, controller_class(args.controller)(), scene)
 
 
@@ -109,9 +109,7 @@ def play(args: Namespace, controller: Controller, scene: Scene) -> int:
     :param controller: who acts
     :param scene: the task
     :return: exit code
-    :raises UsageError: if the picture can not be written
     """
-    _check_render(args.render)
     from sb3_roles.evaluation.episodes import run_episodes
     from sb3_roles.evaluation.metrics import summarize
 
@@ -138,8 +136,12 @@ def play(args: Namespace, controller: Controller, scene: Scene) -> int:
     return 0
 
 
-def _check_render(path: Path | None) -> None:
-    # Before the simulation, which may be long.
+def check_render(path: Path | None) -> None:
+    """Find out whether the picture can be written, before the simulation, which may be long.
+
+    :param path: the file, or None
+    :raises UsageError: if it can not
+    """
     if path is not None and not os.access(path if path.exists() else path.parent, os.W_OK):
         raise UsageError(f"argument --render: {str(path)!r} can not be written")
 

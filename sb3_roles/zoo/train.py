@@ -31,13 +31,7 @@ from sb3_roles.zoo.options import (
     parse_value,
     whole_number,
 )
-from sb3_roles.zoo.run_folder import (
-    ARGS_FILE,
-    RunLock,
-    new_run,
-    note_command,
-    write_description,
-)
+from sb3_roles.zoo.run_folder import ARGS_FILE
 
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
@@ -65,6 +59,18 @@ DEFAULTS: dict[str, Any] = {
     "progress": False,
     "verbose": 1,
 }
+_GIVEN = frozenset(
+    {
+        *DEFAULTS,
+        "n_timesteps",
+        "scene",
+        "n_agents",
+        "env_kwargs",
+        "hyperparams",
+        "conf_file",
+        "resume",
+    }
+)
 # What may be given together with --resume; the rest is the run's.
 _FREE = ("resume", "n_timesteps", "device", "num_threads", "progress", "verbose", "save_freq")
 _STORED = ("eval_freq", "eval_episodes", "save_freq", "log_interval", "tensorboard_log")
@@ -95,7 +101,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     parser.set_defaults(run=run)
 
-    def add(*names: str, help: str, **options: Any) -> None:  # noqa: A002
+    def add(*names: str, help: str, **options: Any) -> None:
         action = parser.add_argument(*names, default=None, help=help, **options)
         default = DEFAULTS.get(action.dest)
         if default is not None and default is not False:
@@ -188,9 +194,7 @@ def run(args: argparse.Namespace) -> int:
         after a signal
     :raises UsageError: if the arguments do not go together
     """
-    given = {
-        key: value for key, value in vars(args).items() if key in _GIVEN and value is not None
-    }
+    given = {key: value for key, value in vars(args).items() if key in _GIVEN and value is not None}
     try:
         if "resume" in given:
             jobs = [_resumed_job(given)]
@@ -215,12 +219,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.parser.prog}: error: {error}", file=sys.stderr)
         return EXIT_DIVERGED
     return 0
-
-
-_GIVEN = frozenset(
-    {*DEFAULTS, "n_timesteps", "scene", "n_agents", "env_kwargs", "hyperparams", "conf_file",
-     "resume"}  # fmt: skip
-)
 
 
 def _new_job(given: Mapping[str, Any], seed: int) -> dict[str, Any]:
@@ -265,36 +263,13 @@ def _resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
         whole = isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
         if not whole and not (name == "num_threads" and value is None):
             raise ConfigError(
-                [f"{path / ARGS_FILE}: {name} must be a whole number from {low} to {high}, got "
-                 f"{value!r}"]  # fmt: skip
+                [f"{path / ARGS_FILE}: {name} must be from {low} to {high}, got {value!r}"]
             )
     if options["device"] not in ("auto", "cpu", "cuda"):
         raise ConfigError([f"{path / ARGS_FILE}: device must be auto, cpu or cuda"])
     if "n_timesteps" in given:
         config["n_timesteps"] = given["n_timesteps"]
     return {"config": config, "options": options, "resume": path}
-
-
-def open_run(job: Mapping[str, Any]) -> tuple[Path, RunLock]:
-    """Make, or find, the run folder of a job, and lock it.
-
-    :param job: see :func:`run`
-    :return: the folder, and its lock
-    :raises UsageError: if another process trains it
-    """
-    options = job["options"]
-    command = [Path(sys.argv[0]).name, *sys.argv[1:]]
-    if job["resume"] is not None:
-        path = Path(job["resume"])
-        lock = RunLock(path)
-        note_command(path, command)
-        return path, lock
-    config = job["config"]
-    path = new_run(Path(options["log_folder"]), config["algo"], config["env"])
-    lock = RunLock(path)
-    plain = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
-    write_description(path, config, plain, command)
-    return path, lock
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The training loop of a run: SB3's, with checkpoints between its iterations, and stops by signal."""
+"""The training loop of a run: SB3's, with checkpoints between iterations, and stops by signal."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -45,7 +46,9 @@ class CsvLog(KVWriter):
         values = filter_excluded_keys(key_values, key_excluded, "csv")
         new = [key for key in values if key not in self.columns]
         self.columns += new
-        self.rows.append([str(values.get(key, "")) for key in self.columns])
+        # A number that waited in a checkpoint is not numpy's any more, and shall look the same.
+        plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}
+        self.rows.append([str(plain.get(key, "")) for key in self.columns])
         if new:
             self._rewrite()
             return

@@ -1,0 +1,417 @@
+"""Checkpoints: exact resumption, atomic writing, damaged files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import zipfile
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.logger import Logger
+from toy_envs import PlainEnv
+
+from sb3_roles.common import checkpoint as ckpt
+from sb3_roles.common.callbacks import EvaluationCallback, RoleCallback, TeamMetricsCallback
+from sb3_roles.common.checkpoint import (
+    CheckpointError,
+    CheckpointFolder,
+    read_checkpoint,
+    write_checkpoint,
+)
+from sb3_roles.common.snapshot import differences, env_gap, load_weights, machine_facts
+from sb3_roles.zoo.algorithms import ALGORITHMS
+from sb3_roles.zoo.config import resolve, write_yaml
+from sb3_roles.zoo.job import make_evaluate
+from sb3_roles.zoo.models import complete, load_model, make_env, make_model
+from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.training import CsvLog, StopSignals, train
+
+SMALL_ENV = {"height": 9, "width": 9, "n_targets": 8, "n_agents": 3, "horizon": 11}
+# 4 teams x 8 steps = 32 joint steps an iteration.
+N, CUT = 96, 32
+MAPS = {
+    "local_channels": [2, 2, 2],
+    "joint_channels": [2, 2, 2, 2],
+    "state_channels": [2, 2, 2],
+    "graph_width": 8,
+}
+TINY = {
+    "TeamPolicy": {**MAPS, "actor_arch": [8], "head_arch": [8], "value_arch": [8]},
+    "RolePolicy": {
+        **MAPS,
+        "role_arch": [8],
+        "role_head_arch": [8],
+        "primitive_arch": [8],
+        "value_arch": [8],
+    },
+    "RowPolicy": {"net_arch": [8]},
+    "RecurrentRowPolicy": {"net_arch": [8], "lstm_hidden_size": 8},
+}
+
+
+SMALL_UPDATES = {"batch_size": 8, "n_epochs": 2, "cg_max_steps": 3, "n_critic_updates": 2}
+
+
+@pytest.fixture(autouse=True)
+def few_threads():
+    before = th.get_num_threads()
+    th.set_num_threads(1)
+    yield
+    th.set_num_threads(before)
+
+
+def small_config(algo, backend="native", env="area-search-v0", **changes):
+    algorithm = ALGORITHMS[algo]
+    settings = {
+        "n_timesteps": N,
+        "n_envs": 4,
+        "env_kwargs": {**SMALL_ENV, "sub_goal": "nearest"} if env == "area-search-v0" else {},
+        "policy_kwargs": TINY[next(iter(algorithm.policies))],
+        "learning_rate": "lin_1.0e-3",
+        "n_steps": 8,
+        **{key: value for key, value in SMALL_UPDATES.items() if key in algorithm.parameters},
+        **changes,
+    }
+    return resolve(algo, env, settings, seed=3, vec_env=backend)
+
+
+def run(folder, config, resume=None, stop_at=None, evaluate=True):
+    """Train in this process; return the model and the newest checkpoint."""
+    # What another process would start with.
+    th.manual_seed(99)
+    random.seed(99)
+    env = make_env(config)
+    model = make_model(config, env, "cpu")
+    log = CsvLog(folder / "progress.csv")
+    model.set_logger(Logger(str(folder), [log]))
+    callbacks = [TeamMetricsCallback(window=10)]
+    if ALGORITHMS[config["algo"]].wrapper == "role":
+        callbacks.append(RoleCallback(window=10))
+    if evaluate:
+        callbacks.append(EvaluationCallback(40, evaluate=make_evaluate(config, 2, 0)))
+    checkpoints = CheckpointFolder(folder / "checkpoints")
+    checkpoints.prepare()
+    before = checkpoints.newest()[1] if resume else None
+    train(
+        model,
+        config["n_timesteps"],
+        checkpoints,
+        StopSignals(),
+        callbacks,
+        [log, *callbacks],
+        config,
+        resume=before,
+        stop_at=stop_at,
+    )
+    env.close()
+    return model, checkpoints.newest()[1]
+
+
+def without_times(state):
+    return {key: value for key, value in state.items() if key != "elapsed_ns"}
+
+
+def assert_same(a, b, where="state"):
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert set(a) == set(b), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}/{key}")
+    elif isinstance(a, list):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_same(x, y, f"{where}/{i}")
+    elif isinstance(a, (np.ndarray, th.Tensor)):
+        assert a.dtype == b.dtype, where
+        assert a.shape == b.shape, where
+        if isinstance(a, th.Tensor):
+            assert th.equal(a, b), where
+        else:
+            assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), where
+    else:
+        assert a == b or (a != a and b != b), where
+
+
+def untimed_rows(path):
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    timed = [i for i, name in enumerate(rows[0]) if name in ("time/fps", "time/time_elapsed")]
+    return [[cell for i, cell in enumerate(row) if i not in timed] for row in rows]
+
+
+EXACT = [
+    ("hmappo", "native", {}),
+    ("hmappo", "supersuit", {}),
+    (
+        "hmappo",
+        "native",
+        {
+            "wrapper_kwargs": {"role_every": 3, "role_control": "random"},
+            "kl_coef": 0.5,
+            "policy_kwargs": {**TINY["RolePolicy"], "norm_layer": "frozen_batch"},
+        },
+    ),
+    (
+        "hmappo",
+        "native",
+        {"policy_kwargs": {**TINY["RolePolicy"], "optimizer_kwargs": {"fused": True}}},
+    ),
+    ("mappo", "native", {}),
+    ("mappo", "supersuit", {}),
+    ("ppo", "native", {}),
+    ("ppo", "supersuit", {}),
+    ("a2c", "native", {}),
+    ("trpo", "native", {}),
+    ("maskable_ppo", "native", {}),
+    ("recurrent_ppo", "native", {}),
+]
+
+
+@pytest.mark.parametrize(("algo", "backend", "changes"), EXACT)
+def test_resumed_training_equals_straight_training(tmp_path, algo, backend, changes):
+    config = small_config(algo, backend, **changes)
+    (tmp_path / "straight").mkdir()
+    (tmp_path / "cut").mkdir()
+    _, straight = run(tmp_path / "straight", config)
+    run(tmp_path / "cut", config, stop_at=CUT)
+    # What was logged after the checkpoint, before the process died, must not stay.
+    with open(tmp_path / "cut" / "progress.csv", "a") as file:
+        file.write("1,2,3\n")
+    _, resumed = run(tmp_path / "cut", config, resume=True)
+    assert straight.manifest["env_steps"] == resumed.manifest["env_steps"] == N
+    assert straight.optimizer
+    assert_same(straight.policy, resumed.policy, "policy")
+    assert_same(straight.optimizer, resumed.optimizer, "optimizer")
+    assert_same(without_times(straight.state), without_times(resumed.state))
+    assert untimed_rows(tmp_path / "straight/progress.csv") == untimed_rows(
+        tmp_path / "cut/progress.csv"
+    )
+
+
+def test_two_runs_differ_only_by_seed(tmp_path):
+    _, first = run(tmp_path, small_config("mappo"), stop_at=32)
+    (tmp_path / "other").mkdir()
+    _, other = run(tmp_path / "other", {**small_config("mappo"), "seed": 4}, stop_at=32)
+    assert any(not th.equal(first.policy[k], other.policy[k]) for k in first.policy)
+
+
+def test_environment_without_state_resumes_inexactly(tmp_path):
+    config = small_config("mappo", "supersuit", env="toy_envs:PlainEnv", policy_kwargs={})
+    env = make_env(config)
+    assert "offers no get_state" in env_gap(env)
+    assert PlainEnv().possible_agents == env.unwrapped.agents
+    run(tmp_path, config, stop_at=CUT, evaluate=False)
+    model, checkpoint = run(tmp_path, config, resume=True, evaluate=False)
+    assert checkpoint.manifest["env_steps"] == N
+    assert model.num_timesteps == 2 * N
+
+
+def test_differences_name_what_changed():
+    facts = machine_facts(th.device("cpu"))
+    assert differences(facts, facts) == []
+    assert differences({**facts, "threads": 99}, facts) == [
+        f"threads was 99, is {facts['threads']}"
+    ]
+
+
+@pytest.fixture
+def content():
+    return {
+        "manifest": {"env_steps": 5},
+        "policy": {"w": th.arange(6.0).reshape(2, 3).t()},
+        "optimizer": {"0.step": th.tensor(3.0)},
+        "state": {
+            "keys": np.array([2**63 + 1], np.uint64),
+            "list": [1, (2.5, None)],
+            "big": 2**100,
+        },
+    }
+
+
+def test_round_trip(tmp_path, content):
+    write_checkpoint(tmp_path / "a.ckpt", **content)
+    read = read_checkpoint(tmp_path / "a.ckpt")
+    assert read.manifest["env_steps"] == 5
+    assert th.equal(read.policy["w"], content["policy"]["w"])
+    assert read.optimizer["0.step"].shape == ()
+    assert read.state["keys"].dtype == np.uint64
+    assert read.state["keys"][0] == 2**63 + 1
+    assert read.state["list"] == [1, [2.5, None]]
+    assert read.state["big"] == 2**100
+    write_checkpoint(tmp_path / "b.ckpt", **content)
+    assert (tmp_path / "a.ckpt").read_bytes() == (tmp_path / "b.ckpt").read_bytes()
+
+
+@pytest.mark.parametrize("value", [object(), {1: 2}, np.array(["a"]), {"x": {"__array__": "y"}}])
+def test_what_can_not_be_stored_is_named(tmp_path, content, value):
+    with pytest.raises(CheckpointError, match="state/odd"):
+        write_checkpoint(tmp_path / "a.ckpt", **{**content, "state": {"odd": value}})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("broken", ["fsync", "replace", "write"])
+def test_a_failed_write_leaves_the_earlier_file(tmp_path, content, monkeypatch, broken):
+    folder = CheckpointFolder(tmp_path)
+    folder.save(1, **content)
+    before = (tmp_path / "step_000000000001.ckpt").read_bytes()
+
+    def fail(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    if broken == "write":
+        monkeypatch.setattr(zipfile.ZipFile, "writestr", fail)
+    else:
+        monkeypatch.setattr(os, broken, fail)
+    for step in (1, 2):
+        with pytest.raises(OSError, match="No space"):
+            folder.save(step, **content)
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["step_000000000001.ckpt"]
+    assert (tmp_path / "step_000000000001.ckpt").read_bytes() == before
+
+
+def test_the_last_ones_are_kept_and_remains_removed(tmp_path, content):
+    folder = CheckpointFolder(tmp_path, keep=2)
+    (tmp_path / ".step_000000000001.ckpt.77.tmp").write_bytes(b"half")
+    folder.prepare()
+    for step in (10, 20, 30):
+        folder.save(step, **content)
+    assert [path.name for path in folder.paths()] == [
+        "step_000000000020.ckpt",
+        "step_000000000030.ckpt",
+    ]
+    assert len(list(tmp_path.iterdir())) == 2
+    with pytest.raises(ValueError, match="at least 2"):
+        CheckpointFolder(tmp_path, keep=1)
+
+
+def test_damaged_files_are_refused(tmp_path, content):
+    folder = CheckpointFolder(tmp_path)
+    folder.save(1, **content)
+    newest = folder.save(2, **content)
+    sound = newest.read_bytes()
+    rng = np.random.default_rng(0)
+    damaged = [sound[: int(n)] for n in rng.integers(0, len(sound), 40)]
+    for position in rng.integers(0, len(sound), 160):
+        flipped = bytearray(sound)
+        flipped[position] ^= 1 << int(rng.integers(8))
+        damaged.append(bytes(flipped))
+    refused = 0
+    for data in damaged:
+        newest.write_bytes(data)
+        try:
+            read = read_checkpoint(newest)
+        except CheckpointError as error:
+            assert "\n" not in str(error)
+            refused += 1
+        else:
+            # A bit that means nothing, such as a date: what was read is what was written.
+            assert_same(read.policy, read_checkpoint(folder.paths()[0]).policy)
+            assert read.state["big"] == 2**100
+    assert refused > 150
+    newest.write_bytes(sound[:100])
+    with pytest.warns(UserWarning, match=r"going back to step_000000000001\.ckpt") as caught:
+        path, _ = folder.newest()
+    assert len(caught) == 1
+    assert path.name == "step_000000000001.ckpt"
+
+
+def rewrite(path, change):
+    """Pack the members again after a change, with a manifest that fits."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    manifest = json.loads(members.pop("manifest.json"))
+    compression = change(manifest, members) or zipfile.ZIP_STORED
+    manifest["members"] = {
+        name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        for name, data in members.items()
+    }
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        archive.writestr("manifest.json", json.dumps(manifest))
+        for name, data in members.items():
+            archive.writestr(name, data)
+
+
+HOSTILE = {
+    "extra": lambda manifest, members: members.update({"../evil.py": b"1"}),
+    "bomb": lambda manifest, members: zipfile.ZIP_DEFLATED,
+    "missing": lambda manifest, members: members.pop("state.json") and None,
+    "pickle": lambda manifest, members: members.update({"policy.safetensors": b"\x80\x04."}),
+    "length": lambda manifest, members: members.update(
+        {"arrays.safetensors": (2**60).to_bytes(8, "little") + b"{}"}
+    ),
+    "deep": lambda manifest, members: members.update({"state.json": b"[" * 100_000}),
+    "version": lambda manifest, members: manifest.update(format_version=99),
+    "format": lambda manifest, members: manifest.update(format="other"),
+    "array": lambda manifest, members: members.update({"state.json": b'{"__array__": "no"}'}),
+    "array key": lambda manifest, members: members.update({"state.json": b'{"__array__": []}'}),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_are_refused(tmp_path, content, name):
+    path = tmp_path / "step_000000000001.ckpt"
+    write_checkpoint(path, **content)
+    rewrite(path, HOSTILE[name])
+    with pytest.raises(CheckpointError) as caught:
+        read_checkpoint(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_huge_file_is_not_read(tmp_path, content, monkeypatch):
+    path = tmp_path / "a.ckpt"
+    write_checkpoint(path, **content)
+    monkeypatch.setattr(ckpt, "MAX_BYTES", 100)
+    with pytest.raises(CheckpointError, match="more than the 100"):
+        read_checkpoint(path)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    config = small_config("hmappo")
+    model, _ = run(folder, config, stop_at=32)
+    write_yaml(folder / "config.yml", complete(config))
+    return folder, model
+
+
+def test_load_model(trained):
+    folder, model = trained
+    state = th.get_rng_state()
+    loaded = load_model(folder, device="cpu")
+    assert th.equal(th.get_rng_state(), state)
+    assert loaded.num_timesteps == model.num_timesteps
+    for name, tensor in model.policy.state_dict().items():
+        assert th.equal(tensor, loaded.policy.state_dict()[name])
+    rows = model.env.reset()
+    actions, _ = model.predict(rows, deterministic=True)
+    assert np.array_equal(actions, loaded.predict(rows, deterministic=True)[0])
+    # As enjoy imports it.
+    assert ckpt.load_model(folder, device="cpu").num_timesteps == model.num_timesteps
+
+
+def test_load_model_refuses(trained, tmp_path):
+    folder, _ = trained
+    with pytest.raises(UsageError, match="no such run folder"):
+        load_model(tmp_path / "none")
+    with pytest.raises(UsageError, match=r"model\.ckpt"):
+        load_model(folder, best=True)
+    write_yaml(tmp_path / "config.yml", small_config("hmappo"))
+    with pytest.raises(UsageError, match="no checkpoint"):
+        load_model(tmp_path)
+
+
+def test_weights_of_another_configuration_are_refused(trained):
+    folder, _ = trained
+    _, checkpoint = CheckpointFolder(folder / "checkpoints").newest()
+    for changes in ({"graph_width": 9}, {"share_encoders": True}):
+        config = small_config("hmappo", policy_kwargs={**TINY["RolePolicy"], **changes})
+        model = make_model(config, make_env(config, 1), "cpu")
+        before = {name: t.clone() for name, t in model.policy.state_dict().items()}
+        with pytest.raises(CheckpointError, match="do not fit the configuration"):
+            load_weights(model, checkpoint)
+        for name, tensor in model.policy.state_dict().items():
+            assert th.equal(tensor, before[name])
