@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Any build will do: TORCH=torch keeps one that is installed in VENV already.
 TORCH ?= torch==2.13.0
+# Joint steps of `make train`.
+STEPS ?= 400000
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
@@ -19,11 +21,18 @@ $(STAMP): setup.cfg pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --editable ".[test,dev,video]"
+	$(BIN)/python -m pip install --quiet --editable ".[test,dev,video,tensorboard]"
 	touch $@
 
 test: $(STAMP) ## run the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4
+
+train: $(STAMP) ## train HMAPPO on the hard scene, evaluate it, draw one episode
+	$(BIN)/python train.py --algo hmappo --env area-search-v0 -n $(STEPS) -f logs -P --verbose 0
+	$(BIN)/python enjoy.py --algo hmappo --env area-search-v0 -f logs --video logs/episode.gif
+
+enjoy: $(STAMP) ## play one episode of the latest run in a window
+	$(BIN)/python enjoy.py --algo hmappo --env area-search-v0 -f logs
 
 check: lint type ## run the linters and the type checker
 
