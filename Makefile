@@ -19,9 +19,9 @@ install: $(STAMP) ## set up the virtual environment
 
 $(STAMP): setup.cfg pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet "$(TORCH)"
-	$(BIN)/python -m pip install --quiet --editable ".[test,dev,video,tensorboard]"
+	$(BIN)/python -m pip install -qq --upgrade pip
+	$(BIN)/python -m pip install -qq "$(TORCH)"
+	$(BIN)/python -m pip install -qq --editable ".[test,dev,plots,video,tensorboard]"
 	touch $@
 
 test: $(STAMP) ## run the tests

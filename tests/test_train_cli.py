@@ -209,3 +209,4 @@ def test_a_foreign_environment(tmp_path):
     result = train("--resume", run, "-n", 96)
     assert result.returncode == 0, result.stderr
     assert "not bit-exact: environment of this run offers no get_state" in result.stdout
+    assert yaml.safe_load((run / "config.yml").read_text())["n_timesteps"] == 96

@@ -20,6 +20,7 @@ COMMANDS = (
     "sb3_roles.zoo.simulate",
     "sb3_roles.zoo.evaluate",
     "sb3_roles.zoo.enjoy",
+    "sb3_roles.zoo.curves",
     "sb3_roles.zoo.bench",
 )
 EXIT_ERROR, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 2, 130, 141

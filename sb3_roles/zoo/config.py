@@ -6,6 +6,7 @@ The layout is rl-zoo's: an environment's name (or ``default``) at the top, then 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -23,7 +24,11 @@ NESTED = ("env_kwargs", "wrapper_kwargs", "policy_kwargs")
 REWARD_SHARING = ("own", "same_role", "team")
 VEC_ENVS = ("auto", "native", "supersuit")
 CONFIG_FILE = "config.yml"
-_CONFIGS = Path(__file__).resolve().parents[2] / "zoo_configs"
+# In the source tree, and where setup.cfg puts them in an installed package.
+_CONFIGS = (
+    Path(__file__).resolve().parents[2] / "zoo_configs",
+    Path(__file__).resolve().parent / "configs",
+)
 _RUN: dict[str, Range] = {"n_timesteps": Whole(1, 1e12), "n_envs": Whole(1, 1e5)}
 _MAX_BYTES = 1 << 20
 
@@ -61,7 +66,9 @@ def read_yaml(path: Path) -> Any:
 def write_yaml(path: Path, values: Mapping[str, Any]) -> None:
     """Write a YAML file of data, keys in their order."""
     text = import_module("yaml").safe_dump(_plain(values), sort_keys=False, allow_unicode=True)
-    path.write_text(text, encoding="utf-8")
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
 
 
 def _plain(value: Any) -> Any:
@@ -74,7 +81,8 @@ def _plain(value: Any) -> Any:
 
 def config_file(algo: str) -> Path:
     """Return the file with an algorithm's configurations."""
-    return _CONFIGS / f"{algo}.yml"
+    folder = next((path for path in _CONFIGS if path.is_dir()), _CONFIGS[0])
+    return folder / f"{algo}.yml"
 
 
 def load_settings(algo: str, env: str, file: Path | None = None) -> dict[str, Any]:

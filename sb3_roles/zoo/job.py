@@ -30,7 +30,7 @@ from sb3_roles.common.checkpoint import (
 )
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.zoo.algorithms import get_algorithm
-from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run
 from sb3_roles.zoo.models import complete, make_env, make_model
 from sb3_roles.zoo.options import UsageError
@@ -87,6 +87,8 @@ def _open_run(job: Mapping[str, Any]) -> tuple[Path, RunLock]:
         path = Path(job["resume"])
         lock = RunLock(path)
         note_command(path, command)
+        # A new n_timesteps is the run's from now on.
+        write_yaml(path / CONFIG_FILE, job["config"])
         return path, lock
     config = job["config"]
     path = new_run(Path(options["log_folder"]), config["algo"], config["env"])
