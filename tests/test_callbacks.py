@@ -17,11 +17,8 @@ from toy_envs import PlainEnv, ToyEnv
 from area_search import AreaSearchEnv
 from sb3_roles import HMAPPO, MAPPO, RoleWrapper, TeamWrapper, make_team_vec_env
 from sb3_roles.common.buffers import TeamRolloutBuffer
-from sb3_roles.common.callbacks import (
-    EvaluationCallback,
-    RoleCallback,
-    TeamMetricsCallback,
-)
+from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
+from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.evaluation.evaluators import VecEnvEvaluator
 
 SMALL = {

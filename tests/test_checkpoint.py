@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import Logger
 from toy_envs import PlainEnv
 
 from sb3_roles.common import checkpoint as ckpt
-from sb3_roles.common.callbacks import EvaluationCallback, RoleCallback, TeamMetricsCallback
+from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import (
     CheckpointError,
     CheckpointFolder,
@@ -23,6 +23,7 @@ from sb3_roles.common.checkpoint import (
     write_checkpoint,
 )
 from sb3_roles.common.snapshot import differences, env_gap, load_weights, machine_facts
+from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import resolve, write_yaml
 from sb3_roles.zoo.job import make_evaluate

@@ -10,24 +10,16 @@ from sb3_roles.common.base_callback import (
     role_options,
     role_wrapper_of,
 )
-from sb3_roles.common.evaluation_callback import (
-    EvaluationCallback,
-    random_state_kept,
-    save_policy,
-)
 from sb3_roles.common.metrics_callback import TeamEpisode, TeamMetricsCallback
 from sb3_roles.common.role_callback import RoleCallback, RoleEpisode
 
 __all__ = [
     "Evaluate",
-    "EvaluationCallback",
     "RoleCallback",
     "RoleEpisode",
     "TeamCallback",
     "TeamEpisode",
     "TeamMetricsCallback",
-    "random_state_kept",
     "role_options",
     "role_wrapper_of",
-    "save_policy",
 ]

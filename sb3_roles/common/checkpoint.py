@@ -15,7 +15,6 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -294,9 +293,3 @@ class CheckpointFolder:
                 warnings.warn(f"{reason}; going back to {path.name}", stacklevel=2)
             return path, checkpoint
         raise CheckpointError(reason or f"{self.folder}: no checkpoint")
-
-
-def load_model(run: str | Path, best: bool = False, device: str = "auto") -> Any:
-    """Rebuild a run's model and load its weights, see ``sb3_roles.zoo.models.load_model``."""
-    # By name: this package does not depend on the command line's.
-    return import_module("sb3_roles.zoo.models").load_model(run, best, device)

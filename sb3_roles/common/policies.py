@@ -24,6 +24,7 @@ from sb3_roles.common.torch_layers import (
     PatchEncoder,
     communication_graph,
     make_map_encoder,
+    map_style,
     resolve_precision,
     symlog,
 )
@@ -32,7 +33,6 @@ STATE_KEY = "state"
 POSITION_KEY = "position"
 # Read by the policy itself, never by its networks.
 _STRUCTURE_KEYS = (AGENT_KEY, ROLE_KEY, ROLE_DUE_KEY, POSITION_KEY)
-_SMALL_MAP = 12
 
 Observation = Mapping[str, th.Tensor]
 
@@ -247,9 +247,7 @@ class TeamPolicy(ActorCriticPolicy):
             if len(shape) != 3:
                 size += int(np.prod(shape))
                 continue
-            style = key if key in self.channels else "joint"
-            if key not in self.channels and min(shape[1:]) <= _SMALL_MAP:
-                style = "local"
+            style = map_style(key, shape)
             name = self._encoder_name(owner, key)
             if name not in self.encoders:
                 self.encoders[name] = make_map_encoder(

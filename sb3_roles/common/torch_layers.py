@@ -175,6 +175,22 @@ class PatchEncoder(nn.Module):
         return self.mix(embedded.flatten(1))
 
 
+# Maps up to this side are read as a robot's own view, larger ones as a team's.
+_SMALL_MAP = 12
+
+
+def map_style(key: str, shape: Sequence[int]) -> str:
+    """Say which kind of map an observation key is.
+
+    :param key: a name of ``CHANNELS`` is the kind itself
+    :param shape: channels, height and width
+    :return: ``"local"``, ``"joint"`` or ``"state"``
+    """
+    if key in CHANNELS:
+        return key
+    return "local" if min(shape[1:]) <= _SMALL_MAP else "joint"
+
+
 # Patch side, patches along a side of the paper's maps, and channels, by kind of map.
 _PATCHES = {"local": (3, 3), "joint": (5, 5), "state": (5, 5)}
 PATCH_CHANNELS = {"local": (16, 64, 32), "joint": (32, 128, 64), "state": (32, 128, 64)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -23,6 +22,7 @@ from sb3_roles.common.names import closest
 from sb3_roles.common.policies import POSITION_KEY, STATE_KEY, TeamPolicy
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY
 from sb3_roles.common.roles import get_roles
+from sb3_roles.common.row_policies import open_moves
 from sb3_roles.common.team_wrapper import AGENT_KEY
 
 if TYPE_CHECKING:
@@ -232,8 +232,7 @@ class PolicyController:
         if self.n_roles:
             parts.append((rows[ROLE_DUE_KEY] > 0.5) | (rows[ROLE_KEY] > 0.5))
         if self.batch is not None:
-            # By name: evaluation does not depend on the command line.
-            parts.append(import_module("sb3_roles.zoo.row_policies").open_moves(rows["local"]))
+            parts.append(open_moves(rows["local"]))
         else:
             space = self.policy.action_space
             n = int(space.nvec[-1] if self.n_roles else space.n)  # type: ignore[attr-defined]

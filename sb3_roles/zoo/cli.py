@@ -17,6 +17,7 @@ from sb3_roles._version import __version__
 from sb3_roles.zoo.options import Parser, UsageError
 
 COMMANDS = (
+    "sb3_roles.zoo.train",
     "sb3_roles.zoo.simulate",
     "sb3_roles.zoo.evaluate",
     "sb3_roles.zoo.enjoy",

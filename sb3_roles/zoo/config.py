@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +49,8 @@ def read_yaml(path: Path) -> Any:
     :param path: the file
     :raises ConfigError: if it can not be read
     """
-    yaml = import_module("yaml")
+    import yaml
+
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ConfigError([f"{path}: larger than {_MAX_BYTES} bytes, this is no configuration"])
@@ -65,7 +65,9 @@ def read_yaml(path: Path) -> Any:
 
 def write_yaml(path: Path, values: Mapping[str, Any]) -> None:
     """Write a YAML file of data, keys in their order."""
-    text = import_module("yaml").safe_dump(_plain(values), sort_keys=False, allow_unicode=True)
+    import yaml
+
+    text = yaml.safe_dump(_plain(values), sort_keys=False, allow_unicode=True)
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text, encoding="utf-8")
     os.replace(partial, path)

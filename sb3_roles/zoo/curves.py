@@ -77,7 +77,7 @@ def read_curves(runs: list[Path], metrics: list[str]) -> Curves:
 
     :param runs: run folders
     :param metrics: columns to read
-    :return: see ``Curves``; joint steps that only some runs of an algorithm have got to are left out
+    :return: see ``Curves``; steps that not all runs of an algorithm have got to are left out
     :raises UsageError: if a file is missing or damaged, or a metric is unknown
     """
     curves: Curves = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))

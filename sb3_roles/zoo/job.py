@@ -21,7 +21,7 @@ from stable_baselines3.common.logger import (
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
-from sb3_roles.common.callbacks import EvaluationCallback, RoleCallback, TeamMetricsCallback
+from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -29,6 +29,7 @@ from sb3_roles.common.checkpoint import (
     write_checkpoint,
 )
 from sb3_roles.common.team_wrapper import find_team_env
+from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run

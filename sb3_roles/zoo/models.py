@@ -49,7 +49,7 @@ def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
         raise UsageError(f"environment {config['env']}: {error}") from error
     if algorithm.whole_teams:
         return roles
-    from sb3_roles.zoo.row_policies import MaskWrapper, OwnViewWrapper
+    from sb3_roles.common.row_policies import MaskWrapper, OwnViewWrapper
 
     if algorithm.masks:
         return MaskWrapper(roles, blocked_moves=config["env"] == AREA_SEARCH)

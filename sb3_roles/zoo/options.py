@@ -6,7 +6,6 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Iterable
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -148,7 +147,7 @@ def parse_value(text: str) -> Any:
         return text
     try:
         # By name: the stubs are not a requirement, and few commands need it at all.
-        yaml = import_module("yaml")
+        import yaml
     except ImportError:
         raise ValueError(f"lists and quoted values need PyYAML, got {text!r}") from None
     try:

@@ -6,7 +6,6 @@ import json
 import random
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_roles.common.base_callback import Evaluate, TeamCallback, csv_bytes, write_atomically
 from sb3_roles.common.names import closest
+from sb3_roles.evaluation.evaluators import make_evaluator
 
 Save = Callable[[BaseAlgorithm, Path, Mapping[str, Any]], None]
 
@@ -105,9 +105,7 @@ class EvaluationCallback(TeamCallback):
     def _init_callback(self) -> None:
         super()._init_callback()
         if self.evaluate is None:
-            # By name: the common package does not depend on evaluation.
-            module = import_module("sb3_roles.evaluation.evaluators")
-            self.evaluate = module.make_evaluator(
+            self.evaluate = make_evaluator(
                 self.model, self.n_episodes, self.seed, self.deterministic
             )
         if self._due is None or self._due > self.joint_steps + self.eval_freq:

@@ -21,10 +21,9 @@ from torch import nn
 from sb3_roles.common.policies import POSITION_KEY, STATE_KEY
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, RoleWrapper
 from sb3_roles.common.team_wrapper import AGENT_KEY
-from sb3_roles.common.torch_layers import CHANNELS, MapEncoder, symlog
+from sb3_roles.common.torch_layers import CHANNELS, MapEncoder, map_style, symlog
 
 _NOT_SEEN = (STATE_KEY, POSITION_KEY, AGENT_KEY, ROLE_DUE_KEY)
-_SMALL_MAP = 12
 
 
 class OwnViewExtractor(BaseFeaturesExtractor):
@@ -42,7 +41,7 @@ class OwnViewExtractor(BaseFeaturesExtractor):
             if key in _NOT_SEEN:
                 continue
             if len(shape) == 3:
-                style = "local" if min(shape[1:]) <= _SMALL_MAP else "joint"
+                style = map_style(key, shape)
                 encoder = MapEncoder(shape[0], style, CHANNELS[style])
                 encoders[key] = encoder
                 size += encoder.out_features
