@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from area_search.render import Snapshot, Window, default_cell_size, draw_frame, map_origin
+from area_search.render import Window, default_cell_size, draw_frame, map_origin
 from area_search.render_map import sensed_cells
 from area_search.render_style import NEUTRAL_ROBOT, ROLE_COLORS
+from area_search.snapshot import Snapshot
 
 
 def make_snapshot(height: int = 15, width: int = 15, **changes: Any) -> Snapshot:

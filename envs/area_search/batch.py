@@ -13,9 +13,10 @@ from area_search import kernels
 from area_search.arrays import TeamArrays
 from area_search.cells import N_ACTIONS
 from area_search.random_streams import seed_key
-from area_search.render import Snapshot, Window, draw_frame
+from area_search.render import Window, draw_frame
 from area_search.rewards import MAX_ROLES, REWARD_COMPONENTS
 from area_search.scenes import Scene, get_scene, shown
+from area_search.snapshot import Snapshot
 
 MAX_EPISODE = 2**62
 

@@ -14,7 +14,7 @@ from area_search import render_style as style
 if TYPE_CHECKING:
     from pygame import Surface
 
-    from area_search.render import Snapshot
+    from area_search.snapshot import Snapshot
 
 # Below these final cell sizes, in pixels, a detail would be noise and is left out.
 _GRID_FROM = 8

@@ -13,7 +13,7 @@ from area_search import render_style as style
 if TYPE_CHECKING:
     from pygame import Surface
 
-    from area_search.render import Snapshot
+    from area_search.snapshot import Snapshot
 
 PANEL_WIDTH = 212
 
