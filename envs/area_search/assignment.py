@@ -40,6 +40,7 @@ def _list_goals(
 def _assign(
     stride: int,
     spread: int,
+    source: np.ndarray,
     distance: np.ndarray,
     lists: np.ndarray,
     counts: np.ndarray,
@@ -51,6 +52,7 @@ def _assign(
 
     Ties go to the robot with the lower index, then to the cell that comes first in the map.
 
+    :param source: int64 (n_agents,), whose search and list of goals a robot shares
     :param spread: a chosen goal blocks the cells up to this far away (1: its 3 x 3 neighborhood)
     :param blocked: uint8 (n,), all 0 before and after
     :param chosen: int64 (n_agents,), overwritten with cells, or -1
@@ -63,15 +65,17 @@ def _assign(
         for i in range(n_agents):
             if chosen[i] != _NOBODY:
                 continue
-            while cursor[i] < counts[i] and blocked[lists[i, cursor[i]]]:
-                cursor[i] += 1
-            if cursor[i] < counts[i]:
-                d = distance[i, lists[i, cursor[i]]]
+            s = source[i]
+            # Robots in one cell share the cursor, too: what is blocked is so for all of them.
+            while cursor[s] < counts[s] and blocked[lists[s, cursor[s]]]:
+                cursor[s] += 1
+            if cursor[s] < counts[s]:
+                d = distance[s, lists[s, cursor[s]]]
                 if best == _NOBODY or d < best_distance:
                     best, best_distance = i, d
         if best == _NOBODY:
             break
-        goal = lists[best, cursor[best]]
+        goal = lists[source[best], cursor[source[best]]]
         chosen[best] = goal
         for dy in range(-spread, spread + 1):
             for dx in range(-spread, spread + 1):
@@ -103,6 +107,7 @@ def assigned_sub_goals(
     owner: np.ndarray,
     owner_distance: np.ndarray,
     territory: np.ndarray,
+    source: np.ndarray,
     out: np.ndarray,
 ) -> None:
     """Per robot and goal set: the goal assigned to it, and the goals that are its own to reach.
@@ -121,22 +126,34 @@ def assigned_sub_goals(
             continue
         flat = cells[m].reshape(-1)
         for i in range(n_agents):
-            start = (position[m, i, 0] + border) * stride + position[m, i, 1] + border
-            counts[2, i] = search(
-                flat, stride, start, goals[m], True, distance[i], moves[i], queue[i], nearest
-            )
+            # Robots in one cell share one search; teams start crowded.
+            source[i] = i
+            for j in range(i):
+                if (
+                    position[m, j, 0] == position[m, i, 0]
+                    and position[m, j, 1] == position[m, i, 1]
+                ):
+                    source[i] = j
+                    break
+            if source[i] == i:
+                start = (position[m, i, 0] + border) * stride + position[m, i, 1] + border
+                counts[2, i] = search(
+                    flat, stride, start, goals[m], True, distance[i], moves[i], queue[i], nearest
+                )
         for goal_set in range(2):
             bit = FRONTIER if goal_set == 0 else KNOWN_TARGET
             for i in range(n_agents):
-                counts[goal_set, i] = _list_goals(
-                    flat, bit, queue[i], counts[2, i], distance[i], lists[i]
-                )
+                if source[i] == i:
+                    counts[goal_set, i] = _list_goals(
+                        flat, bit, queue[i], counts[2, i], distance[i], lists[i]
+                    )
             count = counts[goal_set]
-            _assign(stride, 1 - goal_set, distance, lists, count, cursor, blocked, chosen)
+            _assign(stride, 1 - goal_set, source, distance, lists, count, cursor, blocked, chosen)
             for i in range(n_agents):
-                for k in range(count[i]):
-                    cell = lists[i, k]
-                    d = distance[i, cell]
+                s = source[i]
+                for k in range(count[s]):
+                    cell = lists[s, k]
+                    d = distance[s, cell]
                     if owner_distance[cell] < 0 or d < owner_distance[cell]:
                         owner_distance[cell] = d
                         owner[cell] = i
@@ -144,7 +161,9 @@ def assigned_sub_goals(
                         owner[cell] = _NOBODY
             for i in range(n_agents):
                 territory[:] = 0
-                for k in range(count[i]):
+                s = source[i]
+                # A robot that shares its cell has nothing to itself.
+                for k in range(count[s] if s == i else 0):
                     cell = lists[i, k]
                     if owner[cell] == i:
                         worth = table[min(distance[i, cell], last)]
@@ -155,12 +174,14 @@ def assigned_sub_goals(
                 if goal == _NOBODY:
                     encode(features[: N_ACTIONS + 1], -1, 0, table)
                 else:
-                    encode(features[: N_ACTIONS + 1], distance[i, goal], moves[i, goal], table)
+                    encode(features[: N_ACTIONS + 1], distance[s, goal], moves[s, goal], table)
                 for action in range(N_ACTIONS):
                     features[N_ACTIONS + 1 + action] = territory[action] / SCALE
             for i in range(n_agents):
-                for k in range(count[i]):
-                    owner_distance[lists[i, k]] = -1
+                if source[i] == i:
+                    for k in range(count[i]):
+                        owner_distance[lists[i, k]] = -1
         for i in range(n_agents):
-            for k in range(counts[2, i]):
-                moves[i, queue[i, k]] = 0
+            if source[i] == i:
+                for k in range(counts[2, i]):
+                    moves[i, queue[i, k]] = 0

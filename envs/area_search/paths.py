@@ -71,6 +71,7 @@ def search_scratch(sub_goal: str, n_agents: int, area: int) -> tuple[np.ndarray,
         np.zeros(area, np.int32),  # owner
         np.full(area, -1, np.int32),  # owner_distance
         np.zeros(N_ACTIONS, np.int64),  # territory
+        np.zeros(n_agents, np.int64),  # source
     )
 
 
