@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-
-import numpy as np
+from math import isfinite
+from typing import TYPE_CHECKING
 
 from sb3_roles.common.names import closest
+
+# The command line checks names of roles before anything heavy is imported.
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @dataclass(frozen=True)
@@ -72,13 +76,15 @@ def weight_vector(what: str, weights: Mapping[str, float], components: Sequence[
     :return: float32 (n_components,)
     :raises ValueError: if a component is unknown or a weight is not a finite number
     """
+    import numpy as np
+
     vector = np.zeros(len(components), np.float32)
     for name, weight in weights.items():
         if name not in components:
             raise ValueError(closest(f"reward component in {what}", name, components))
         if isinstance(weight, bool) or not isinstance(weight, (int, float)):
             raise ValueError(f"{what}: the weight of {name!r} must be a number, got {weight!r}")
-        if not np.isfinite(weight):
+        if not isfinite(weight):
             raise ValueError(f"{what}: the weight of {name!r} must be finite, got {weight!r}")
         vector[list(components).index(name)] = weight
     return vector
@@ -101,6 +107,8 @@ def primitive_weights(
     :return: float32 (n_roles, n_components)
     :raises ValueError: if a name is unknown, or a role is missing
     """
+    import numpy as np
+
     if weights == "role_reward":
         return np.tile(role_weights, (len(roles), 1))
     if weights == "identity":
