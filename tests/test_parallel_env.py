@@ -199,7 +199,7 @@ def test_keys_of_infos(variant: str) -> None:
     rng = np.random.default_rng(0)
     for _ in range(3):
         _, infos = env.reset(seed=1)
-        # A reset's infos would overwrite those of the last step on some paths (see TRAPS).
+        # A reset's infos would overwrite those of the last step on some paths.
         assert infos == {agent: {} for agent in env.possible_agents}
         while env.agents:
             _, rewards, _, _, infos = env.step(random_actions(env, rng))

@@ -83,7 +83,9 @@ class RoleWrapper(TeamWrapper):
         self.reward_sharing = reward_sharing
         self.role_every = role_every
         self.role_control = role_control
-        self._role_seeds = np.array(team_seeds(0, self.n_teams), np.uint64)
+        pending = [seed for seed in self.team_env._seeds[:: self.n_agents] if seed is not None]
+        seeds = pending or team_seeds(0, self.n_teams)
+        self._role_seeds = np.array(seeds, np.uint64)
         self._episodes = np.zeros(self.n_teams, np.uint64)
         self.current_roles = np.full(self.num_envs, -1, np.int64)
         self._episode_steps = np.zeros(self.num_envs, np.int64)

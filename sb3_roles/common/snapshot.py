@@ -97,12 +97,14 @@ def _env_state(env: VecEnv) -> dict[str, Any]:
 
 
 def _set_env_state(env: VecEnv, state: Mapping[str, Any]) -> None:
+    if state["teams"] is None:
+        # New episodes begin: what the wrappers knew of the old ones does not hold.
+        return
     team_env, rows = find_team_env(env), _team_rows(env)
-    if state["teams"] is not None:
-        if len(state["teams"]) != len(rows):
-            raise CheckpointError("the environments' state is of another number of teams")
-        for row, one in zip(rows, state["teams"], strict=True):
-            team_env.env_method("set_state", one, indices=row)
+    if len(state["teams"]) != len(rows):
+        raise CheckpointError("the environments' state is of another number of teams")
+    for row, one in zip(rows, state["teams"], strict=True):
+        team_env.env_method("set_state", one, indices=row)
     layers = [layer for layer in _wrappers(env) if hasattr(layer, "set_state")]
     for layer, one in zip(layers, state["wrappers"], strict=True):
         layer.set_state(one)
@@ -256,7 +258,7 @@ def restore(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
         _set_env_state(model.env, state["env"])
         if state["env"]["teams"] is not None:
             _set_observations(model, state)
-        if state["lstm"] is not None:
+        if state["lstm"] is not None and state["env"]["teams"] is not None:
             _set_lstm(model, state["lstm"])
         window = model._stats_window_size
         model.ep_info_buffer = deque(state["ep_info"], maxlen=window)

@@ -1,6 +1,6 @@
 """The metrics of the paper's tables, as pure functions of recorded episodes.
 
-Three that must never be confused (PAPER_FACTS.md): ``explo_paper`` counts newly seen cells,
+Three that must never be confused: ``explo_paper`` counts newly seen cells,
 obstacles included and start discs excluded, over the free cells, and can exceed 100 %;
 ``explo_true`` is the explored share of the free cells; ``cover`` the share of the targets that were
 covered. The paper prints the first as exploration.

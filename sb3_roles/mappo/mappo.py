@@ -302,7 +302,7 @@ class MAPPO(OnPolicyAlgorithm):
             if has_statistics:
                 # Without gradients this many rows cost little.
                 obs = self.rollout_buffer.spread_observations(max(2, self.batch_size))
-                self.policy.streams(obs)
+                self.policy.streams(obs, deterministic=True)
 
     def _optimize(self, loss: th.Tensor) -> None:
         """Take one step, unless it would destroy the weights."""

@@ -1,4 +1,4 @@
-"""The policy of MAPPO: one actor, one critic; with its graph, the ECC baseline's network."""
+"""The policy of MAPPO: one actor with a graph, one critic."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ class TeamActorCriticPolicy(TeamPolicy):
     """A move from what a robot sees and hears; a value from the state (CTDE).
 
     The actor encodes its keys, mixes them by an MLP, exchanges the result with the robots that can
-    communicate, and maps it to logits. With the arguments of ``zoo_configs/ecc.yml`` it is the
-    network of ECC (Blumenkamp and Prorok, 2020).
+    communicate, and maps it to logits: the form of ECC's network (Blumenkamp and Prorok, 2020).
 
     :param actor_arch: layers before the graph
     :param head_arch: hidden layers behind the graph
