@@ -131,9 +131,9 @@ def _defaults(cls: type, ranges: Mapping[str, Range], given: Mapping[str, Any]) 
 def load_model(run: str | Path, best: bool = False, device: str = "auto") -> OnPolicyAlgorithm:
     """Rebuild a run's model from ``config.yml``, and load its weights.
 
-    Nothing in the folder is unpickled; but a run of a ``module:factory`` environment names code that
-    is imported and called: load such runs only if you trust them. The model has an environment of one
-    team, which was never reset.
+    Nothing in the folder is unpickled; but a run of a ``module:factory`` environment names code
+    that is imported and called: load such runs only if you trust them. The model has an environment
+    of one team, which was never reset.
 
     :param run: the run folder
     :param best: the weights that evaluated best, instead of the latest ones
