@@ -124,7 +124,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("-params", "--hyperparams", **pairs, help="keys of the configuration to change, such as "
         "gamma:0.9 'policy_kwargs:{graph: false}'")  # fmt: skip
     add("-conf", "--conf-file", type=Path, metavar="FILE", help="configuration to read instead of "
-        "zoo_configs/<algo>.yml; a run's config.yml repeats that run")  # fmt: skip
+        "zoo_configs/<algo>.yml; of a run's config.yml the hyperparameters are taken")  # fmt: skip
     add("--seed", type=whole_number(0, MAX_SEED), metavar="S", help="seed of the run")
     add("--n-seeds", type=whole_number(1, 1000), metavar="K", help="runs with seeds S .. S+K-1, "
         "one after the other")  # fmt: skip
