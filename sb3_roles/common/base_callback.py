@@ -12,22 +12,12 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_roles.common.role_wrapper import RoleWrapper
+from sb3_roles.common.role_wrapper import role_wrapper_of
 from sb3_roles.common.team_wrapper import find_team_env
 
 Evaluate = Callable[[BaseAlgorithm], Mapping[str, float]]
-
-
-def role_wrapper_of(env: VecEnv | None) -> RoleWrapper | None:
-    """Return the ``RoleWrapper`` among the layers of an environment, if there is one."""
-    layer: Any = env
-    while isinstance(layer, VecEnvWrapper):
-        if isinstance(layer, RoleWrapper):
-            return layer
-        layer = layer.venv
-    return None
 
 
 def role_options(env: VecEnv | None) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_roles.common import roles as role_registry
@@ -239,3 +239,13 @@ class RoleWrapper(TeamWrapper):
         self._episode_steps[:] = state["episode_steps"]
         self._episodes[:] = state["episodes"]
         self._role_seeds[:] = state["role_seeds"]
+
+
+def role_wrapper_of(env: VecEnv | None) -> RoleWrapper | None:
+    """Return the ``RoleWrapper`` among the layers of an environment, if there is one."""
+    layer: Any = env
+    while isinstance(layer, VecEnvWrapper):
+        if isinstance(layer, RoleWrapper):
+            return layer
+        layer = layer.venv
+    return None

@@ -8,10 +8,10 @@ import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_roles.common.policies import TeamPolicy
-from sb3_roles.common.role_wrapper import RoleWrapper
+from sb3_roles.common.role_wrapper import RoleWrapper, role_wrapper_of
 from sb3_roles.common.team_wrapper import TeamWrapper
 from sb3_roles.hmappo.policies import RoleActorCriticPolicy
 from sb3_roles.mappo.mappo import (
@@ -94,20 +94,10 @@ class HMAPPO(MAPPO):
         return [role, *super()._settings()]
 
     def _stream_rewards(self, env: VecEnv, rewards: np.ndarray) -> np.ndarray:
-        return find_role_wrapper(env).stream_rewards
+        wrapper = role_wrapper_of(env)
+        if wrapper is None:
+            raise ValueError(f"no RoleWrapper around {env}: roles are part of its actions")
+        return wrapper.stream_rewards
 
     def _to_env(self, actions: np.ndarray) -> np.ndarray:
         return actions
-
-
-def find_role_wrapper(env: VecEnv | None) -> RoleWrapper:
-    """Return the ``RoleWrapper`` among the layers of an environment.
-
-    :raises ValueError: if there is none
-    """
-    layer: Any = env
-    while not isinstance(layer, RoleWrapper):
-        if not isinstance(layer, VecEnvWrapper):
-            raise ValueError(f"no RoleWrapper around {env}: roles are part of its actions")
-        layer = layer.venv
-    return layer

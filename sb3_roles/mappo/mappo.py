@@ -295,6 +295,10 @@ class MAPPO(OnPolicyAlgorithm):
                 break
         self._update_statistics()
         self._log_update(history, n_steps)
+        for s, records in enumerate(history):
+            if self.kl_coefs[s] > 0:
+                kl = float(th.stack([record.kl for record in records]).mean())
+                self.kl_coefs[s] = adapt_kl_coef(self.kl_coefs[s], kl, self.kl_target)
 
     def _update_statistics(self) -> None:
         """Let frozen normalization layers see the rollout, between an update and the next one."""
@@ -333,9 +337,7 @@ class MAPPO(OnPolicyAlgorithm):
             variance = explained_variance(values.flatten(), returns.flatten())
             self.logger.record(prefix + "explained_variance", float(variance))
             if self.kl_coefs[s] > 0:
-                kl = float(th.stack([record.kl for record in records]).mean())
                 self.logger.record(prefix + "kl_coef", self.kl_coefs[s])
-                self.kl_coefs[s] = adapt_kl_coef(self.kl_coefs[s], kl, self.kl_target)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/optimizer_steps", n_steps, exclude="tensorboard")
 

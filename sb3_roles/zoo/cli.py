@@ -24,7 +24,7 @@ COMMANDS = (
     "sb3_roles.zoo.curves",
     "sb3_roles.zoo.bench",
 )
-EXIT_ERROR, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 2, 130, 141
+EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
 
 
 def make_parser() -> Parser:

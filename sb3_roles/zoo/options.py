@@ -135,7 +135,7 @@ def parse_value(text: str) -> Any:
 
     :param text: the part after the colon
     :return: the value
-    :raises ValueError: if it begins like YAML and is none, or PyYAML is not installed
+    :raises ValueError: if it begins like YAML and is none
     """
     if _INTEGER.fullmatch(text):
         return int(text)
@@ -145,11 +145,8 @@ def parse_value(text: str) -> Any:
         return _CONSTANTS[text.lower()]
     if not text.startswith(("[", "{", '"', "'")):
         return text
-    try:
-        # By name: the stubs are not a requirement, and few commands need it at all.
-        import yaml
-    except ImportError:
-        raise ValueError(f"lists and quoted values need PyYAML, got {text!r}") from None
+    import yaml  # Few command lines need it at all.
+
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError:
