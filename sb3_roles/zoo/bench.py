@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
 
-COMMANDS = ("sb3_roles.zoo.bench_env",)
+COMMANDS = ("sb3_roles.zoo.bench_env", "sb3_roles.zoo.bench_train")
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -11,9 +11,10 @@ import operator
 import statistics
 import tempfile
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.zoo.bench_report import against, cells, machine_lines, row, spread
 from sb3_roles.zoo.env_cases import ROBOTS, SIDES, SUB_GOALS, Case, case_name, make_cases
 from sb3_roles.zoo.machine import describe_machine, fresh_python
 from sb3_roles.zoo.options import positive_number, whole_number
@@ -119,7 +120,7 @@ def measure_startup(repeats: int = 3) -> dict[str, Any]:
     total = sum(added)
     return {
         "imports": {
-            statement: _against(_spread(seconds), IMPORT_TARGET, operator.lt)
+            statement: against(spread(seconds), IMPORT_TARGET, operator.lt)
             for statement, seconds in times.items()
         },
         "compile": {
@@ -127,20 +128,6 @@ def measure_startup(repeats: int = 3) -> dict[str, Any]:
             "total": {"seconds": total, "target": COMPILE_TARGET, "met": total < COMPILE_TARGET},
         },
     }
-
-
-def _spread(values: Sequence[float]) -> dict[str, Any]:
-    return {"median": statistics.median(values), "min": min(values), "max": max(values)}
-
-
-def _against(
-    spread: dict[str, Any],
-    target: float | None,
-    meets: Callable[[float, float], bool] = operator.ge,
-) -> dict[str, Any]:
-    """Add a target, and whether the median meets it, to a spread."""
-    met = None if target is None else bool(meets(spread["median"], target))
-    return {**spread, "target": target, "met": met}
 
 
 def _describe(case: Case) -> dict[str, Any]:
@@ -152,7 +139,7 @@ def _describe(case: Case) -> dict[str, Any]:
         "side": case.scene.width,
         "n_teams": case.n_teams,
         "joint_steps": case.joint_steps,
-        "joint_steps_per_second": _against(_spread(case.rates), RATE_TARGETS.get(case.name)),
+        "joint_steps_per_second": against(spread(case.rates), RATE_TARGETS.get(case.name)),
         # Above 1 would mean more than one core; far below it, that others had the core.
         "cpu_share": statistics.median(case.cpu_shares),
     }
@@ -164,7 +151,7 @@ def _ratios(cases: dict[str, Case]) -> dict[str, dict[str, Any]]:
     for api in ("native_vec_env", "pettingzoo", "supersuit_vec_env", "reference"):
         slow = cases[case_name(api, "none", 4, 25)]
         values = [a / b for a, b in zip(fast.rates, slow.rates, strict=True)]
-        ratios[f"native / {api}"] = _against(_spread(values), RATIO_TARGETS.get(api))
+        ratios[f"native / {api}"] = against(spread(values), RATIO_TARGETS.get(api))
     return ratios
 
 
@@ -183,7 +170,7 @@ def _growth(cases: dict[str, Case]) -> list[dict[str, Any]]:
                     "along": along,
                     "sizes": list(sizes),
                     "microseconds": [1e6 / statistics.median(case.rates) for case in some],
-                    "exponent": _against(_spread(exponents), EXPONENT_TARGET, operator.le),
+                    "exponent": against(spread(exponents), EXPONENT_TARGET, operator.le),
                 }
             )
     return growth
@@ -202,48 +189,31 @@ def log_log_slope(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def _table(report: dict[str, Any]) -> str:
-    machine, config = report["machine"], report["config"]
-    load = machine["load_before"]
+    config = report["config"]
     lines = [
-        f"{machine['cpu']}, {machine['cores']} cores ({machine['usable_cores']} usable), "
-        f"load before {'?' if load is None else f'{load:.2f}'}",
-        f"python {machine['python']}, numpy {machine['numpy']}, numba {machine['numba']}, "
-        f"sb3_roles {machine['sb3_roles']}",
+        *machine_lines(report["machine"]),
         f"{config['repeats']} interleaved rounds, at least {config['seconds_per_case']:g} s a case",
         "",
-        _row("joint steps per second, one core", "median", "range", "target", "CPU share"),
+        row("joint steps per second, one core", "median", "range", "target", "CPU share"),
     ]
     for case in report["cases"]:
         rate = case["joint_steps_per_second"]
         teams = f"{case['n_teams']} team{'' if case['n_teams'] == 1 else 's'}"
         label = f"{case['name']}, {teams}"
-        lines.append(_row(label, *_cells(rate, ",.0f"), f"{case['cpu_share']:.2f}"))
-    lines += ["", _row("speed ratio, 4 robots 25x25", "median", "range", "target")]
-    lines += [_row(name, *_cells(ratio, ",.1f")) for name, ratio in report["ratios"].items()]
-    lines += ["", _row("growth exponent of the cost", "median", "range", "target", "us/step")]
+        lines.append(row(label, *cells(rate, ",.0f"), f"{case['cpu_share']:.2f}"))
+    lines += ["", row("speed ratio, 4 robots 25x25", "median", "range", "target")]
+    lines += [row(name, *cells(ratio, ",.1f")) for name, ratio in report["ratios"].items()]
+    lines += ["", row("growth exponent of the cost", "median", "range", "target", "us/step")]
     for line in report["growth"]:
         costs = " ".join(f"{cost:.3g}" for cost in line["microseconds"])
         label = f"{line['sub_goal']}, {line['along']} {' '.join(map(str, line['sizes']))}"
-        lines.append(_row(label, *_cells(line["exponent"], ".2f", "<="), costs))
-    lines += ["", _row("start-up, fresh process", "seconds", "range", "target")]
-    lines += [_row(name, *_cells(spread, ".2f", "<")) for name, spread in report["imports"].items()]
+        lines.append(row(label, *cells(line["exponent"], ".2f", "<="), costs))
+    lines += ["", row("start-up, fresh process", "seconds", "range", "target")]
+    lines += [row(name, *cells(found, ".2f", "<")) for name, found in report["imports"].items()]
     compiled = report["compile"]
     for sub_goal, seconds in compiled["added"].items():
-        lines.append(_row(f"first use, empty cache: {sub_goal} adds", f"{seconds:.1f}"))
+        lines.append(row(f"first use, empty cache: {sub_goal} adds", f"{seconds:.1f}"))
     total = compiled["total"]
-    seconds, _, target = _cells({**total, **_spread([total["seconds"]])}, ".1f", "<")
-    lines.append(_row("first use, empty cache: total", seconds, "", target))
+    seconds, _, target = cells({**total, **spread([total["seconds"]])}, ".1f", "<")
+    lines.append(row("first use, empty cache: total", seconds, "", target))
     return "\n".join(lines)
-
-
-def _row(label: str, median: str, spread: str = "", target: str = "", last: str = "") -> str:
-    return f"{label:49}{median:>11}  {spread:22}{target:19}{last}".rstrip()
-
-
-def _cells(spread: dict[str, Any], style: str, relation: str = ">=") -> tuple[str, str, str]:
-    target = ""
-    if spread["target"] is not None:
-        verdict = "met" if spread["met"] else "MISSED"
-        target = f"{relation} {spread['target']:,.0f} {verdict}"
-    low, high = format(spread["min"], style), format(spread["max"], style)
-    return format(spread["median"], style), f"{low} .. {high}", target

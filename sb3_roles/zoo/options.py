@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction["Parser"]
 
 MAX_SEED = 2**63 - 1
+# What torch, numpy and SB3 take as a seed of a whole run.
+MAX_TRAINING_SEED = 2**32 - 1
 _INTEGER = re.compile(r"[+-]?[0-9]{1,100}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,5})?")
 _CONSTANTS = {"true": True, "false": False, "null": None, "none": None, "~": None}
@@ -51,6 +53,8 @@ class Parser(argparse.ArgumentParser):
 
     def _check_option(self, given: str) -> None:
         name = given.split("=")[0]
+        if not name.startswith("--") and name[:2] in self._option_string_actions:
+            return  # A short option with its value attached, -n5000.
         if name.startswith("-") and name not in self._option_string_actions:
             options = [name for name in self._option_string_actions if name.startswith("--")]
             self.error(unknown("option", name, options))
@@ -75,6 +79,20 @@ def one_of(what: str, allowed: Iterable[str]) -> Callable[[str], str]:
         return text
 
     return name
+
+
+def several_of(what: str, allowed: Iterable[str]) -> Callable[[str], tuple[str, ...]]:
+    """Make the type of an option that takes some names with commas between, each of them once.
+
+    :param what: the kind of thing that is named
+    :param allowed: the names that exist
+    """
+    one = one_of(what, allowed)
+
+    def several(text: str) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(one(name.strip()) for name in text.split(",")))
+
+    return several
 
 
 def whole_number(low: int, high: int) -> Callable[[str], int]:

@@ -1,0 +1,86 @@
+"""``sb3-roles bench train``: what it counts and reports, not how fast it is."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from sb3_roles.zoo.bench_report import against, cells, spread
+from sb3_roles.zoo.bench_train import PARTS, Stopwatch
+from sb3_roles.zoo.cli import main
+
+
+def test_every_case_does_the_same_counted_work(capsys):
+    options = ["--algo", "hmappo,ppo", "--iterations", "1", "--repeats", "2", "--num-threads", "1"]
+    assert main(["bench", "train", *options, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["machine"]["torch_threads"] == 1
+    hmappo, ppo = report["cases"]
+    assert (hmappo["name"], ppo["name"]) == ("hmappo native", "ppo native")
+    for case in (hmappo, ppo):
+        steps = 2 * 50 * case["n_teams"]
+        assert case["work"]["joint_steps"] == steps
+        assert case["work"]["robot_steps"] == 4 * steps
+        shares = case["share_of_time"]
+        assert set(shares) == {*PARTS, "rest"}
+        assert sum(shares.values()) == pytest.approx(1.0, abs=0.02)
+        assert all(0.0 < shares[part] < 1.0 for part in PARTS)
+        rate = case["joint_steps_per_second"]
+        assert 0.0 < rate["min"] <= rate["median"] <= rate["max"]
+    # 3200 joint steps in minibatches of 800, four epochs, two rounds.
+    assert hmappo["work"]["optimizer_steps"] == 2 * 4 * 4
+    # Team maps (2 and 5 channels of 625 cells) once per team, local ones (4 of 81) per robot.
+    least = 7 * 625 + 4 * 4 * 81
+    assert least < hmappo["observation_bytes_per_joint_step"] < 2 * least
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--algo", "hmapo"], "did you mean 'hmappo'?"),
+        (["--algo", "hmappo,"], "''"),
+        (["--vec-env", "nativ"], "did you mean 'native'?"),
+        (["--repeats", "0"], "from 1"),
+        (["--scene", "hart"], "did you mean 'hard'?"),
+        (["--n-agents", "0"], "n_agents"),
+    ],
+)
+def test_wrong_options_are_one_line(capsys, options, message):
+    try:
+        code = main(["bench", "train", *options])
+    except SystemExit as stop:
+        code = stop.code
+    captured = capsys.readouterr()
+    assert code == 2
+    assert message in captured.err and "Traceback" not in captured.err
+    assert captured.out == ""
+
+
+def test_nested_methods_count_once():
+    class Work:
+        def outer(self):
+            time.sleep(0.02)
+            self.inner()
+
+        def inner(self):
+            time.sleep(0.02)
+
+    work, watch = Work(), Stopwatch()
+    watch.watch("outer", work, "outer")
+    watch.watch("inner", work, "inner")
+    work.outer()
+    assert watch.seconds["inner"] == 0.0
+    assert watch.seconds["outer"] >= 0.04
+    work.inner()
+    assert watch.seconds["inner"] >= 0.02
+
+
+def test_targets_are_reported_as_they_come_out():
+    found = spread([3.0, 1.0, 2.0])
+    assert (found["median"], found["min"], found["max"]) == (2.0, 1.0, 3.0)
+    assert against(found, 2.0)["met"] is True
+    assert against(found, 2.5)["met"] is False
+    assert cells(against(found, 2.5), ".1f") == ("2.0", "1.0 .. 3.0", ">= 2 MISSED")
+    assert cells(against(found, None), ".0f") == ("2", "1 .. 3", "")
