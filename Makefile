@@ -21,7 +21,7 @@ $(STAMP): setup.cfg pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --upgrade pip
 	$(BIN)/python -m pip install -qq "$(TORCH)"
-	$(BIN)/python -m pip install -qq --editable ".[test,dev,plots,video,tensorboard]"
+	$(BIN)/python -m pip install -qq --editable ".[test,dev,plots,video,tensorboard,vrp]"
 	touch $@
 
 test: $(STAMP) ## run the tests

@@ -17,14 +17,26 @@ from helpers import (
 )
 from pettingzoo import ParallelEnv
 from sb3_contrib import TRPO
+from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3 import A2C, PPO
-from toy_envs import PlainEnv
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.dqn.policies import QNetwork
+from toy_envs import BareCountingEnv, CountingEnv, PlainEnv
 
+from area_search import BatchedAreaSearch, get_scene
 from sb3_roles import HMAPPO, MAPPO, RoleWrapper, TeamWrapper
 from sb3_roles.common.buffers import TeamRolloutBuffer
-from sb3_roles.common.team_vec_env import make_team_vec_env
+from sb3_roles.common.callbacks import TeamMetricsCallback
+from sb3_roles.common.row_policies import open_moves
+from sb3_roles.common.team_vec_env import make_team_vec_env, team_seeds
 from sb3_roles.common.torch_layers import NORM_LAYERS, FrozenBatchNorm2d, has_fast_bfloat16
+from sb3_roles.evaluation.episodes import run_episodes
+from sb3_roles.evaluation.evaluators import VecEnvEvaluator
+from sb3_roles.evaluation.policies import PolicyController
 from sb3_roles.hmappo import RoleActorCriticPolicy
+from sb3_roles.zoo.config import resolve
+from sb3_roles.zoo.models import make_env
+from sb3_roles.zoo.models import make_model as make_zoo_model
 
 OURS = {"mappo": (MAPPO, "TeamPolicy", SMALL_TEAM), "hmappo": (HMAPPO, "RolePolicy", SMALL_ROLE)}
 STOCK = {
@@ -459,23 +471,100 @@ def test_every_algorithm_trains_everywhere(algorithm, env_name):
     model.predict(model.env.reset())
 
 
-class CountingEnv(PlainEnv):
-    """Observes a number by a Discrete space, as many environments do."""
+SMALL_SCENE = {"height": 9, "width": 9, "n_targets": 10, "horizon": 12, "n_agents": 3}
 
-    def observation_space(self, agent):
-        return spaces.Dict(
-            {"count": spaces.Discrete(6), "noise": spaces.Box(-9, 9, (3,), np.float32)}
+
+def registered(algo, env="area-search-v0", **settings):
+    """A small untrained model of the registry, and its configuration."""
+    settings = {"n_timesteps": 100, "n_envs": 2, "n_steps": 4, "batch_size": 4, **settings}
+    if env == "area-search-v0":
+        settings["env_kwargs"] = SMALL_SCENE
+    config = resolve(algo, env, settings, seed=0)
+    return make_zoo_model(config, make_env(config), "cpu"), config
+
+
+@pytest.mark.parametrize("env", [CountingEnv, BareCountingEnv])
+@pytest.mark.parametrize("algo", ["mappo", "hmappo", "ppo", "maskable_ppo", "recurrent_ppo"])
+def test_observations_of_discrete_spaces_can_be_learned_from(algo, env):
+    name = f"toy_envs:{env.__name__}"
+    policy = {"net_arch": [8]} if "_" in algo else {"graph_width": 8}
+    policy |= {"lstm_hidden_size": 8} if algo == "recurrent_ppo" else {}
+    model, config = registered(algo, name, n_steps=10, policy_kwargs=policy)
+    before = weights(model)
+    model.learn(2 * 10 * model.n_envs)
+    moved = [name for name, value in weights(model).items() if not th.equal(value, before[name])]
+    assert moved
+    assert all(th.isfinite(value).all() for value in weights(model).values())
+    scores = VecEnvEvaluator(make_env(config), 3)(model)
+    assert scores["length"] == 5.0
+
+
+@pytest.mark.parametrize("algo", ["maskable_ppo", "recurrent_ppo", "ppo"])
+def test_actions_that_are_drawn_do_not_depend_on_who_is_simulated_beside(algo):
+    model, _ = registered(algo)
+    controller = PolicyController(model, deterministic=False)
+    state = th.get_rng_state()
+    scene = get_scene("hard", **SMALL_SCENE)
+    whole = run_episodes(controller, scene, 20, seed=1)
+    assert set(np.unique(whole.roles)) == {0, 1}
+    for batch_size in (1, 7):
+        again = run_episodes(controller, scene, 20, seed=1, batch_size=batch_size)
+        np.testing.assert_array_equal(whole.roles, again.roles)
+        for name, curves in whole.curves.items():
+            np.testing.assert_array_equal(curves, again.curves[name])
+    assert th.equal(state, th.get_rng_state())
+    likeliest = run_episodes(PolicyController(model), scene, 20, seed=1)
+    assert not np.array_equal(whole.curves["cover"], likeliest.curves["cover"])
+
+
+@pytest.mark.parametrize("algo", ["maskable_ppo", "recurrent_ppo"])
+def test_the_likeliest_actions_are_those_of_predict(algo):
+    model, _ = registered(algo)
+    controller, batch = PolicyController(model), BatchedAreaSearch("hard", 2, **SMALL_SCENE)
+    env = model.env
+    env.seed(11)
+    observations, state, starts = env.reset(), None, np.ones(env.num_envs, np.bool_)
+    batch.reset([int(seed) for seed in team_seeds(11, 2)])
+    controller.begin(batch)
+    for _ in range(11):
+        masks = {"action_masks": get_action_masks(env)} if algo == "maskable_ppo" else {}
+        actions, state = model.predict(observations, state, starts, True, **masks)
+        observations, _, starts, _ = env.step(actions)
+        moves, _ = controller.predict({})
+        np.testing.assert_array_equal(controller.roles.ravel(), actions[:, 0])
+        np.testing.assert_array_equal(moves, actions[:, 1])
+        batch.step(moves.reshape(2, 3))
+
+
+def test_masked_moves_are_never_drawn():
+    model, _ = registered("maskable_ppo")
+    controller, batch = (
+        PolicyController(model, deterministic=False),
+        BatchedAreaSearch("hard", 50, **SMALL_SCENE),
+    )
+    batch.reset(0)
+    controller.begin(batch)
+    tried = set()
+    for _ in range(12):
+        open_ = open_moves(batch.observations["local"].reshape(150, 4, 9, 9))
+        moves, _ = controller.predict({})
+        assert open_[np.arange(150), moves].all()
+        tried |= set(moves)
+        batch.step(moves.reshape(50, 3))
+    assert tried == {0, 1, 2, 3, 4}
+
+
+def test_only_actor_critic_policies_are_played():
+    with pytest.raises(ValueError) as caught:
+        PolicyController(
+            QNetwork(
+                spaces.Box(0, 1, (2,)),
+                spaces.Discrete(2),
+                FlattenExtractor(spaces.Box(0, 1, (2,))),
+                2,
+            )
         )
-
-    def observe(self):
-        noise = np.zeros(3, np.float32)
-        return {a: {"count": np.int64(self.clock), "noise": noise} for a in self.possible_agents}
-
-
-def test_observations_of_a_discrete_space_can_be_learned_from():
-    env = make_team_vec_env(CountingEnv, 2, 0)
-    model = make_model("hmappo", env, sharp=False)
-    model.learn(2 * 10 * env.num_envs)
+    assert one_line(caught.value) == "only actor-critic policies can be played, not QNetwork"
 
 
 @pytest.mark.parametrize("view_radius", [1, 2])
@@ -649,7 +738,7 @@ def test_an_update_stops_where_it_has_gone_too_far():
 def test_logs_count_joint_steps_and_robot_steps(kind):
     model = make_model(kind, env=small_search(n_teams=2, n_agents=3))
     logs = record_logs(model)
-    model.learn(3 * 10 * 6)
+    model.learn(3 * 10 * 6, callback=TeamMetricsCallback())
     assert [log["time/env_steps"] for log in logs] == [20, 40, 60]
     assert [log["time/agent_steps"] for log in logs] == [60, 120, 180]
     prefixes = ["train/"] if kind == "mappo" else ["train/role_", "train/primitive_"]

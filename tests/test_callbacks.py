@@ -7,17 +7,19 @@ import json
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch as th
-from sb3_contrib import TRPO
+from helpers import one_line
+from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.logger import configure
-from toy_envs import PlainEnv, ToyEnv
+from toy_envs import PlainEnv, ToyEnv, WitnessEnv
 
 from area_search import AreaSearchEnv
 from sb3_roles import HMAPPO, MAPPO, RoleWrapper, TeamWrapper, make_team_vec_env
 from sb3_roles.common.buffers import TeamRolloutBuffer
-from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
+from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback, TeamProgressBar
+from sb3_roles.common.checkpoint import read_checkpoint
+from sb3_roles.common.row_policies import MaskedRowPolicy, MaskWrapper
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.evaluation.evaluators import VecEnvEvaluator
 
@@ -105,6 +107,8 @@ def test_every_algorithm_logs_teams(algo, tmp_path):
     with open(tmp_path / "progress.csv") as file:
         last = list(csv.DictReader(file))[-1]
     assert float(last["rollout/team_episodes"]) >= N_TEAMS
+    assert float(last["time/env_steps"]) == 2 * HORIZON * N_TEAMS
+    assert float(last["time/agent_steps"]) == 2 * HORIZON * N_TEAMS * 3
     assert 0 <= float(last["rollout/cover"]) <= 1
     assert 0 <= float(last["rollout/t90_share"]) <= 1
     has_roles = algo is not MAPPO
@@ -205,12 +209,16 @@ def test_evaluation_counts_joint_steps_and_keeps_the_best(tmp_path):
     model = make_model(n_steps=10)
     model.learn(5 * 40 * 3, callback=callback)
     assert [row["env_steps"] for row in callback.history] == [40, 80, 120, 160, 200]
-    best = json.loads((tmp_path / "best" / "best.json").read_text())
+    saved = read_checkpoint(tmp_path / "best" / "model.ckpt")
+    best = saved.manifest["record"]
     assert (best["metric"], best["value"], best["env_steps"]) == ("cover", 0.5, 80)
-    saved = safetensors.torch.load_file(tmp_path / "best" / "policy.safetensors")
-    assert saved.keys() == seen[1].keys()
-    assert all(th.equal(value, seen[1][name]) for name, value in saved.items())
-    assert not list(tmp_path.rglob("*.partial"))
+    assert saved.policy.keys() == seen[1].keys()
+    assert all(th.equal(value, seen[1][name]) for name, value in saved.policy.items())
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [
+        "best",
+        "evaluations.csv",
+        "model.ckpt",
+    ]
     with open(tmp_path / "evaluations.csv") as file:
         rows = list(csv.DictReader(file))
     assert [row["agent_steps"] for row in rows] == ["120", "240", "360", "480", "600"]
@@ -244,6 +252,81 @@ def test_an_unknown_metric_is_named():
     callback = EvaluationCallback(1, metric="cver", evaluate=lambda model: {"cover": 0.0})
     with pytest.raises(ValueError, match="did you mean 'cover'"):
         make_model().learn(1, callback=callback)
+
+
+class OneMove(MaskWrapper):
+    """All moves but one are masked."""
+
+    move = 0
+
+    def _look(self, observations):
+        super()._look(observations)
+        self.masks[:, 2:] = np.arange(2) == self.move
+        return observations
+
+
+def masked_model(role_every):
+    env = MaskWrapper(RoleWrapper(make_team_vec_env(PlainEnv, 1, 0), role_every=role_every), False)
+    return MaskablePPO(MaskedRowPolicy, env, n_steps=4, batch_size=4, seed=0, device="cpu")
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("move", [0, 1])
+def test_policies_with_masks_are_evaluated_with_them(move, deterministic):
+    env = OneMove(RoleWrapper(make_team_vec_env(PlainEnv, 2, 0)), False)
+    env.move = move
+    scores = VecEnvEvaluator(env, 4, deterministic=deterministic)(masked_model(1))
+    # Both robots are paid the number of their move, at each of 5 steps.
+    assert scores["return"] == 2 * 5 * move
+
+
+def test_roles_that_last_are_kept_in_the_evaluation_of_a_policy_with_masks():
+    env = MaskWrapper(RoleWrapper(make_team_vec_env(PlainEnv, 2, 0), role_every=3), False)
+    # A role that does not go on is an error of the wrapper.
+    scores = VecEnvEvaluator(env, 4, deterministic=False)(masked_model(3))
+    assert scores["length"] == 5.0
+
+
+def test_closing_the_callback_closes_the_environment_of_its_evaluation():
+    WitnessEnv.closed.clear()
+    env = TeamWrapper(make_team_vec_env(WitnessEnv, 2))
+    callback = EvaluationCallback(10, evaluate=VecEnvEvaluator(env, 2))
+    assert not WitnessEnv.closed
+    callback.close()
+    assert len(WitnessEnv.closed) == 2
+    # Nothing is open in a function, nor before the first evaluation.
+    EvaluationCallback(10, evaluate=lambda model: {}).close()
+    EvaluationCallback(10).close()
+
+
+@pytest.mark.filterwarnings("ignore:rich is experimental")
+@pytest.mark.parametrize("algo", [PPO, HMAPPO])
+def test_the_progress_bar_counts_joint_steps(algo):
+    bar = TeamProgressBar()
+    model = make_model(algo)
+    rollout = HORIZON * N_TEAMS
+    model.learn(2 * rollout * 3, callback=bar)
+    assert (bar.pbar.total, bar.pbar.n) == (2 * rollout, 2 * rollout)
+    # A run that goes on begins where it was.
+    model.learn(rollout * 3, callback=bar, reset_num_timesteps=False)
+    assert (bar.pbar.total, bar.pbar.initial, bar.pbar.n) == (
+        3 * rollout,
+        2 * rollout,
+        3 * rollout,
+    )
+
+
+@pytest.mark.parametrize("callback", [TeamMetricsCallback, RoleCallback])
+def test_windows_hold_the_last_episodes(callback):
+    one = callback(window=3)
+    make_model().learn(2 * HORIZON * N_TEAMS * 3, callback=one)
+    assert len(one.window) == 3
+    for wrong in (0, 2.5, True):
+        with pytest.raises(ValueError) as caught:
+            callback(window=wrong)
+        assert one_line(caught.value) == (
+            f"window must be a whole number of at least 1, got {wrong!r}"
+        )
 
 
 @pytest.mark.parametrize("options", [{"eval_freq": 0}, {"eval_freq": 5, "n_episodes": 0}])

@@ -6,13 +6,14 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import zipfile
 
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.logger import Logger
-from toy_envs import PlainEnv
+from toy_envs import PlainEnv, WitnessEnv
 
 from sb3_roles.common import checkpoint as ckpt
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
@@ -82,6 +83,7 @@ def small_config(algo, backend="native", env="area-search-v0", **changes):
 
 def run(folder, config, resume=None, stop_at=None, evaluate=True):
     """Train in this process; return the model and the newest checkpoint."""
+    folder.mkdir(exist_ok=True)
     # What another process would start with.
     th.manual_seed(99)
     random.seed(99)
@@ -208,6 +210,52 @@ def test_environment_without_state_resumes_inexactly(tmp_path):
     model, checkpoint = run(tmp_path, config, resume=True, evaluate=False)
     assert checkpoint.manifest["env_steps"] == N
     assert model.num_timesteps == 2 * N
+
+
+def first_observations(folder, config, **options):
+    """Train on ``WitnessEnv``; return what the episodes of its four teams began with."""
+    WitnessEnv.seen.clear()
+    run(folder, config, evaluate=False, **options)
+    return list(WitnessEnv.seen)
+
+
+def test_without_its_state_an_environment_does_not_repeat_its_first_episodes(tmp_path):
+    config = small_config("mappo", "supersuit", env="toy_envs:WitnessEnv", policy_kwargs={})
+    start = first_observations(tmp_path / "a", config, stop_at=CUT)
+    for other in ("b", "c"):
+        shutil.copytree(tmp_path / "a", tmp_path / other)
+    resumed = first_observations(tmp_path / "a", config, resume=True)
+    # The first four are those of SB3's reset, before the checkpoint is put back.
+    assert resumed[:4] == start[:4]
+    assert len(resumed) > 8
+    assert not set(resumed[4:]) & set(start)
+    # They are a function of the seed and of where the run was.
+    assert first_observations(tmp_path / "b", config, resume=True) == resumed
+    other = first_observations(tmp_path / "c", {**config, "seed": 9}, resume=True)
+    assert not set(other) & set(resumed)
+
+
+@pytest.mark.parametrize("algo", ["mappo", "hmappo", "recurrent_ppo"])
+def test_records_of_an_episode_that_was_cut_off_are_dropped(tmp_path, algo):
+    # Episodes of 5 steps, a checkpoint after 8: each team is in the middle of one.
+    changes = {} if algo == "recurrent_ppo" else {"policy_kwargs": {}}
+    config = small_config(algo, "supersuit", env="toy_envs:PlainEnv", **changes)
+    _, cut = run(tmp_path, config, stop_at=CUT, evaluate=False)
+    metrics = dict(cut.state["stateful"])["TeamMetricsCallback"]
+    assert metrics["steps"].tolist() == [3] * 4
+    _, resumed = run(tmp_path, config, resume=True, evaluate=False)
+    states = dict(resumed.state["stateful"])
+    metrics = states["TeamMetricsCallback"]
+    lengths = metrics["window_metrics"][:, metrics["metric_names"].index("length")]
+    assert len(lengths) == 10
+    assert set(lengths) == {5.0}
+    assert metrics["steps"].tolist() == [16 % 5] * 4
+    if "RoleCallback" in states:
+        roles = states["RoleCallback"]
+        assert roles["steps"].tolist() == [16 % 5] * 4
+        # Two robots have a role in each of the 5 steps.
+        assert (roles["window_counts"].sum(axis=2) == 2).all()
+        assert roles["window_counts"].shape[1] == 5
 
 
 def test_differences_name_what_changed():
@@ -390,6 +438,29 @@ def test_load_model(trained):
     rows = model.env.reset()
     actions, _ = model.predict(rows, deterministic=True)
     assert np.array_equal(actions, loaded.predict(rows, deterministic=True)[0])
+
+
+def test_load_model_takes_the_best_weights_that_the_callback_wrote(tmp_path):
+    config = small_config("hmappo")
+    env = make_env(config)
+    model = make_model(config, env, "cpu")
+    seen = []
+
+    def evaluate(model):
+        seen.append({name: value.clone() for name, value in model.policy.state_dict().items()})
+        return {"cover": [0.1, 0.5, 0.2][len(seen) - 1]}
+
+    callback = EvaluationCallback(32, evaluate=evaluate, folder=tmp_path)
+    model.learn(3 * 32 * 3, callback=callback)
+    env.close()
+    write_yaml(tmp_path / "config.yml", complete(config))
+    loaded = load_model(tmp_path, best=True, device="cpu")
+    assert loaded.num_timesteps == 2 * 32 * 3
+    assert len(seen) == 3
+    for name, value in loaded.policy.state_dict().items():
+        assert th.equal(value, seen[1][name])
+        if "value" in name and "weight" in name:
+            assert not th.equal(value, seen[2][name])
 
 
 def test_load_model_refuses(trained, tmp_path):

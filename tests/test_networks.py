@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -29,6 +30,7 @@ from sb3_roles.common.torch_layers import (
     resolve_precision,
     updating_statistics,
 )
+from sb3_roles.common.vectors import as_vectors, vector_size
 
 KINDS = list(POLICIES)
 TEAM_KEYS = ("joint", "state")
@@ -499,6 +501,41 @@ def test_bad_options_give_one_line(options, hint):
     with pytest.raises(ValueError) as caught:
         make_policy("hmappo", **options)
     assert hint in one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("space", "values", "expected"),
+    [
+        (spaces.Discrete(3), [2, 0], [[0, 0, 1], [1, 0, 0]]),
+        # As SB3's buffers hand them back.
+        (spaces.Discrete(3), [[2], [0]], [[0, 0, 1], [1, 0, 0]]),
+        (spaces.MultiDiscrete([2, 3]), [[1, 0], [0, 2]], [[0, 1, 1, 0, 0], [1, 0, 0, 0, 1]]),
+        (spaces.MultiBinary(2), [[0, 1], [1, 1]], [[0, 1], [1, 1]]),
+        (spaces.Box(0, 1, (1, 2), np.float32), [[[0.5, 1]], [[0, 0]]], [[0.5, 1], [0, 0]]),
+        (spaces.Box(0, np.inf, (1,), np.float32), [[0], [np.e - 1]], [[0], [1]]),
+        (spaces.Box(0, 255, (2,), np.uint8), [[255, 0], [1, 2]], [[255, 0], [1, 2]]),
+    ],
+)
+def test_observations_become_vectors(space, values, expected):
+    vectors = as_vectors(space, th.as_tensor(np.array(values, space.dtype)))
+    assert vectors.dtype == th.float32
+    assert vectors.shape == (2, vector_size(space))
+    np.testing.assert_allclose(vectors.numpy(), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_choices_that_are_observed_are_read_as_one_hots(kind):
+    space = policy_space()
+    discrete = make_policy(kind, spaces.Dict({**space.spaces, "hint": spaces.Discrete(4)}))
+    box = make_policy(kind, spaces.Dict({**space.spaces, "hint": spaces.Box(0, 1, (4,))}))
+    box.load_state_dict(discrete.state_dict())
+    obs, hint = make_observation(2, 3), th.tensor([0, 1, 2, 3, 1, 0])
+    given = outputs(discrete, {**obs, "hint": hint})
+    same = outputs(box, {**obs, "hint": th.eye(4)[hint]})
+    other = outputs(discrete, {**obs, "hint": 3 - hint})
+    assert_close(given, same)
+    assert not th.allclose(given.choices, other.choices)
+    assert not th.allclose(given.values, other.values)
 
 
 def vector_space(**boxes):

@@ -2,15 +2,18 @@
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
-from helpers import SMALL_ROLE, one_line, small_search
+from helpers import SMALL_ROLE, hand_made, one_line, small_search, weights
 from toy_envs import BatchedToy, PlainEnv, ToyEnv
 
 from sb3_roles import HMAPPO, RoleWrapper
 from sb3_roles.common import roles as registry
+from sb3_roles.common.role_rules import NearestRole
 from sb3_roles.common.roles import Role, get_roles, register_role
-from sb3_roles.common.team_vec_env import make_team_vec_env
+from sb3_roles.common.team_vec_env import make_team_vec_env, team_seeds
 from sb3_roles.common.team_wrapper import TeamWrapper
+from sb3_roles.evaluation.policies import PolicyController
 
 # Pays for the components of the toy environment.
 WALK, COUNT = Role("walk", "move"), Role("count", "team")
@@ -327,6 +330,156 @@ def test_the_wrapper_goes_on_from_its_state(control):
             np.testing.assert_array_equal(observations[key], value)
 
 
+# Roles by a rule: the nearest goal, on hand-made maps (see ``helpers.SYMBOLS``).
+
+RULE_MAPS = {
+    # Frontier cells are explored, free, and beside an unexplored cell.
+    "a target is nearer": (["0T..?"], ["cover"]),
+    "the frontier is nearer": (["?.0..T"], ["explore"]),
+    "a tie is for the target": (["?..0.T"], ["cover"]),
+    "the wall makes the target far": (["?.0#T", "#...."], ["explore"]),
+    "no target is known": (["0...?"], ["explore"]),
+    "no frontier is left": (["0...T"], ["cover"]),
+    "each robot for itself": (["0T.....1.?"], ["cover", "explore"]),
+}
+
+
+@pytest.mark.parametrize("name", RULE_MAPS)
+@pytest.mark.parametrize("names", [("explore", "cover"), ("cover", "explore")])
+def test_the_nearest_goal_makes_the_role(name, names):
+    rows, expected = RULE_MAPS[name]
+    batch = hand_made(rows, sub_goal="nearest")
+    rule = NearestRole(get_roles(names), batch.goal_nearness)
+    assert rule.keys == ("sub_goal",)
+    seen = batch.observations["sub_goal"].reshape(batch.n_agents, 2, -1)
+    assert [names[k] for k in rule({"sub_goal": seen})] == expected
+
+
+def by_nearness(sub_goal):
+    """The rule, written out: the target unless the frontier is nearer."""
+    return np.where(sub_goal[:, 0, 5] > sub_goal[:, 1, 5], 0, 1)
+
+
+@pytest.mark.parametrize("sub_goal", ["nearest", "assigned"])
+@pytest.mark.parametrize("backend", ["native", "supersuit"])
+@pytest.mark.parametrize("role_every", [1, 3])
+def test_roles_by_the_rule_are_given_and_last(sub_goal, backend, role_every):
+    roles = {"role_control": "nearest", "role_every": role_every}
+    env = small_search(sub_goal=sub_goal, backend=backend, roles=roles, horizon=8)
+    observations, clock, rng = env.reset(), 0, np.random.default_rng(0)
+    expected = np.full(env.num_envs, -1)
+    seen = set()
+    for _ in range(24):
+        if clock % role_every == 0:
+            expected = by_nearness(observations["sub_goal"])
+        np.testing.assert_array_equal(observations["role"], np.eye(2)[expected])
+        assert not observations["role_due"].any()
+        seen |= set(expected)
+        actions = np.stack([expected, rng.integers(0, 5, env.num_envs)], axis=1)
+        observations, _, dones, _ = env.step(actions)
+        clock = 0 if dones.all() else clock + 1
+    assert seen == {0, 1}
+
+
+@pytest.mark.parametrize("role_every", [1, 3])
+@pytest.mark.parametrize("see_sub_goal", [True, False])
+def test_episodes_are_played_with_the_roles_of_the_rule(role_every, see_sub_goal):
+    roles = {"role_control": "nearest", "role_every": role_every}
+    env = small_search(sub_goal="nearest", roles=roles)
+    keys = None if see_sub_goal else ["local"]
+    policy = {**SMALL_ROLE, "actor_keys": keys, "critic_keys": keys}
+    model = HMAPPO("RolePolicy", env, n_steps=10, batch_size=10, policy_kwargs=policy, seed=0)
+    controller = PolicyController(model)
+    batch = env.team_env.batched
+    other = type(batch)(batch.scene, batch.n_teams, "nearest")
+    env.seed(4)
+    observations = env.reset()
+    other.reset([int(seed) for seed in team_seeds(4, batch.n_teams)])
+    controller.begin(other)
+    for _ in range(9):
+        actions, _ = model.predict(observations, deterministic=True)
+        moves, _ = controller.predict({})
+        np.testing.assert_array_equal(controller.roles.ravel(), actions[:, 0])
+        np.testing.assert_array_equal(moves, actions[:, 1])
+        observations, *_ = env.step(actions)
+        other.step(moves.reshape(other.n_teams, -1))
+    # Also for the bare policy, and where it has no environment of its own.
+    bare = PolicyController(model.policy, roles)
+    bare.begin(other)
+    assert bare.roles is not None
+    with pytest.raises(RuntimeError, match=r"call begin\(batch\)"):
+        alone = PolicyController(model.policy, roles)
+        alone.start(1, 3)
+        alone.choose({"local": observations["local"][:3]}, np.zeros((3, 3)))
+
+
+def test_training_with_roles_by_the_rule_moves_the_primitive_policy_only():
+    env = small_search(sub_goal="nearest", roles={"role_control": "nearest"})
+    model = HMAPPO("RolePolicy", env, n_steps=10, batch_size=10, policy_kwargs=SMALL_ROLE, seed=0)
+    before = weights(model)
+    model.learn(2 * 10 * env.num_envs)
+    moved = {name for name, value in weights(model).items() if not th.equal(value, before[name])}
+    assert any(name.startswith("action_net") for name in moved)
+    assert not any(name.startswith(("role_net", "role_mlp", "role_graph")) for name in moved)
+
+
+@pytest.mark.parametrize(
+    ("options", "sub_goal", "part"),
+    [
+        ({}, "none", "needs an environment that declares goal_nearness"),
+        ({"roles": (Role("a", "cover", "tarqet"),)}, "nearest", "did you mean 'target'"),
+        (
+            {"roles": (Role("a", "cover", "target"), Role("b", "explore", "target"))},
+            "nearest",
+            "'a' and 'b' both head for 'target'",
+        ),
+    ],
+)
+def test_the_rule_says_what_it_needs(options, sub_goal, part):
+    with pytest.raises(ValueError) as caught:
+        small_search(sub_goal=sub_goal, roles={"role_control": "nearest", **options})
+    assert part in one_line(caught.value)
+
+
+class NearEnv(PlainEnv):
+    """Declares where its robots see how near their goals are, of which the first wins a tie."""
+
+    goal_nearness = {"far": ("observation", (1,)), "near": ("observation", (0,))}  # noqa: RUF012
+
+    def observation_space(self, agent):
+        return spaces.Dict({"observation": super().observation_space(agent)})
+
+    def observe(self):
+        values = {"a": [0.0, 0.0, 9.0], "b": [self.clock, 2.0, 9.0]}
+        return {a: {"observation": np.array(v, np.float32)} for a, v in values.items()}
+
+
+def test_other_environments_can_declare_the_nearness_of_goals():
+    roles = (Role("stay", "reward", "near"), Role("go", "reward", "far"))
+    env = make_team_vec_env(NearEnv, 1, 0)
+    env = RoleWrapper(env, roles=roles, role_control="nearest")
+    observations, given = env.reset(), []
+    for _ in range(4):
+        given.append(observations["role"].argmax(axis=1))
+        actions = np.stack([given[-1], np.zeros(2, int)], axis=1)
+        observations, *_ = env.step(actions)
+    # Robot b: far until the clock is above 2, the tie included.
+    assert np.array(given).T.tolist() == [[1, 1, 1, 1], [1, 1, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    "place", [("observatio", (0,)), ("observation", (3,)), ("observation", (0, 0))]
+)
+def test_a_wrong_place_of_nearness_is_named(place):
+    class Wrong(NearEnv):
+        goal_nearness = {"near": place}  # noqa: RUF012
+
+    with pytest.raises(ValueError) as caught:
+        make_team_vec_env(Wrong, 1)
+    assert repr(place[0]) in one_line(caught.value)
+    assert "'near'" in str(caught.value)
+
+
 @pytest.fixture
 def third_role():
     role = register_role(Role("rest", reward_component="explore", goal_set="frontier"))
@@ -374,6 +527,7 @@ BAD = [
     ({"role_every": True}, "got True"),
     ({"role_control": "lerned"}, "did you mean 'learned'"),
     ({"role_control": "explorer"}, "did you mean 'explore'"),
+    ({"role_control": "neares"}, "did you mean 'nearest'"),
 ]
 
 

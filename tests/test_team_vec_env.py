@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from helpers import one_line
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
@@ -359,6 +360,28 @@ def test_human_rendering_asks_each_team_once(mode):
     vec_env = NativeTeamVecEnv(batched)
     assert vec_env.render(mode) is None
     assert frames == [(0, "human"), (1, "human"), (2, "human")]
+
+
+@pytest.mark.parametrize(
+    ("space", "part"),
+    [
+        (spaces.Discrete(3, start=1), "subtract start=1"),
+        (spaces.MultiDiscrete([[2, 2]]), "flatten nvec"),
+        (spaces.Text(5), "encode it as one of them"),
+    ],
+)
+@pytest.mark.parametrize("key", ["hint", None])
+def test_observations_that_no_policy_reads_are_refused_with_key_and_space(space, part, key):
+    class Odd(PlainEnv):
+        def observation_space(self, agent):
+            return space if key is None else spaces.Dict({key: space})
+
+    with pytest.raises(ValueError) as caught:
+        make_team_vec_env(Odd, 2)
+    message = one_line(caught.value)
+    assert str(space) in message
+    assert part in message
+    assert ("observation 'hint'" if key else "the observation is") in message
 
 
 def test_close_twice():

@@ -1,5 +1,7 @@
 """Small multi-agent environments for the tests: a foreign one, and one with all declarations."""
 
+from typing import ClassVar
+
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
@@ -39,6 +41,55 @@ class PlainEnv(ParallelEnv):
         infos = {a: {"late": self.clock} for a in agents}
         flags = dict.fromkeys(agents, False), dict.fromkeys(agents, over)
         return self.observe(), rewards, *flags, infos
+
+
+class WitnessEnv(PlainEnv):
+    """Notes the first number that each of its episodes shows, and who was closed."""
+
+    seen: ClassVar[list[float]] = []
+    closed: ClassVar[list["WitnessEnv"]] = []
+
+    def close(self):
+        self.closed.append(self)
+
+    def reset(self, seed=None, options=None):
+        observations, infos = super().reset(seed, options)
+        self.seen.append(float(observations["a"][0]))
+        return observations, infos
+
+
+class CountingEnv(PlainEnv):
+    """Observes numbers by discrete spaces, as many environments do."""
+
+    parts: ClassVar = {
+        "count": spaces.Discrete(6),
+        "pair": spaces.MultiDiscrete([6, 2]),
+        "bits": spaces.MultiBinary(3),
+        "noise": spaces.Box(-9, 9, (3,), np.float32),
+    }
+
+    def observation_space(self, agent):
+        return spaces.Dict(self.parts)
+
+    def observe(self):
+        clock = self.clock
+        seen = {
+            "count": np.int64(clock),
+            "pair": np.array([clock, clock % 2], np.int64),
+            "bits": np.array([clock & 1, clock & 2, clock & 4], np.int8).clip(max=1),
+            "noise": np.zeros(3, np.float32),
+        }
+        return {agent: {key: seen[key] for key in self.parts} for agent in self.possible_agents}
+
+
+class BareCountingEnv(CountingEnv):
+    """Observes one number, without a Dict around it."""
+
+    def observation_space(self, agent):
+        return self.parts["count"]
+
+    def observe(self):
+        return dict.fromkeys(self.possible_agents, np.int64(self.clock))
 
 
 class BatchedToy:

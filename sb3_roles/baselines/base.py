@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -14,11 +14,16 @@ States = tuple[np.ndarray, ...]
 
 
 class Controller(Protocol):
-    """Chooses the actions of whole teams; every SB3 model is one.
+    """Chooses the actions of whole teams; ``PolicyController`` makes one of an SB3 model.
 
-    Two optional attributes are for scripted controllers, see :class:`ScriptedController`:
-    ``begin(batch)`` and ``uses_observation`` (True where it is missing).
+    Optional attributes: ``sub_goal`` (path features that the batch shall observe), ``roles`` (int8
+    (n_teams, n_agents), those of the last step) and ``role_names``, ``name`` (a label),
+    ``description`` (a dict of JSON values that tells it from others of its class),
+    ``deterministic`` and ``communicate`` (where it has such a choice). Records keep the last five.
     """
+
+    def begin(self, batch: BatchedAreaSearch) -> None:
+        """Take the teams to control; all of them have just begun an episode."""
 
     def predict(
         self,
@@ -29,8 +34,7 @@ class Controller(Protocol):
     ) -> tuple[np.ndarray, States | None]:
         """Choose an action for each row.
 
-        :param observation: key -> (n_teams * n_agents, ...), rows are robots, contiguous by team;
-            the arrays are overwritten by the next step
+        :param observation: empty when episodes are played: controllers read the batch
         :param state: what the last call returned, None at first
         :param episode_start: bool (rows,), True where an episode begins
         :param deterministic: take the likeliest action instead of drawing one
@@ -45,9 +49,6 @@ class ScriptedController(ABC):
     What they do must be a function of the team's episode alone, so that no result depends on which
     teams are simulated together.
     """
-
-    uses_observation: ClassVar[bool] = False
-    """Whether ``predict`` reads ``observation``; if not, it may be an empty dict."""
 
     batch: BatchedAreaSearch | None = None
 

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import os
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -33,29 +29,25 @@ def role_options(env: VecEnv | None) -> dict[str, Any]:
     return {name: getattr(wrapper, name) for name in names}
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader, or an interruption, never meets half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
-
-
-def csv_bytes(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> bytes:
-    """Return a table as the bytes of a csv file."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return text.getvalue().encode()
-
-
 class TeamCallback(BaseCallback):
-    """Knows the teams below the rows; the base of the callbacks here."""
+    """Knows the teams below the rows; the base of the callbacks here.
+
+    :param verbose: see ``BaseCallback``
+    """
+
+    def __init__(self, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self._running: dict[str, np.ndarray] = {}
+        """What is known of the episodes that have not ended, each (n_teams, ...)."""
 
     def _init_callback(self) -> None:
         self.team_env = find_team_env(self.training_env)
         self.n_teams, self.n_agents = self.team_env.n_teams, self.team_env.n_agents
+
+    def _on_rollout_start(self) -> None:
+        # Episodes may have begun since the last step: training that goes on after a reset.
+        for array in self._running.values():
+            array[self._begun()] = 0
 
     def _begun(self) -> np.ndarray:
         """Bool (n_teams,): which teams have not made a step in their episode yet."""

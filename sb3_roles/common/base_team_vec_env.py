@@ -10,7 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs
 
-from sb3_roles.common.env_declarations import check_observation_space, declared, env_layers
+from sb3_roles.common.env_declarations import (
+    check_observation_space,
+    declared,
+    declared_goals,
+    env_layers,
+)
 
 
 def team_seeds(seed: int | None, n: int) -> list[int]:
@@ -40,16 +45,18 @@ class TeamVecEnv(VecEnv):
     * ``reward_components``: float32 ``(num_envs, n_components)``, of the last step;
     * ``metrics``: name -> float64 ``(n_teams,)``, of the last step; for a team whose episode has
       just ended these are the final values, not those after the reset;
-    * ``team_keys``: keys of a Dict observation that are the same for all robots of a team.
+    * ``team_keys``: keys of a Dict observation that are the same for all robots of a team;
+    * ``goal_nearness``: where robots observe how near their goals are, see ``declared_goals``.
 
-    Both are zero after ``reset()``, and fresh arrays at every step.
+    The first two are zero after ``reset()``, and fresh arrays at every step.
 
     The info of a row that is not done holds what the environment put there, and nothing else. That
     of a finished row also holds ``"terminal_observation"`` (the row's own, a copy),
     ``"TimeLimit.truncated"`` (truncated and not terminated) and, where the environment has it,
     ``"episode_metrics"``.
 
-    :param env: the environment that declares ``metadata`` and ``render_mode``, both optional
+    :param env: the environment that declares ``metadata``, ``render_mode`` and ``goal_nearness``,
+        all optional
     :param n_teams: number of teams
     :param agents: names of the robots of a team, in row order
     :param observation_space: of one robot: a flat Dict, or a simple space
@@ -60,7 +67,8 @@ class TeamVecEnv(VecEnv):
     :param expand_team_observations: ``True`` (the SB3 interface) repeats the value of a team key
         for each robot, so that all arrays have ``num_envs`` rows; ``False`` returns it once per
         team, with leading dimension ``n_teams``. ``observation_space`` is per robot in both cases.
-    :raises ValueError: if SB3 can not take the observation space, or a team key is not in it
+    :raises ValueError: if SB3 can not take the observation space, or a key that is declared is not
+        in it
     """
 
     def __init__(
@@ -83,6 +91,7 @@ class TeamVecEnv(VecEnv):
         self.team_keys = team_keys
         self.component_names = component_names
         self.metric_names = metric_names
+        self.goal_nearness = declared_goals(env, observation_space, team_keys)
         self.expand_team_observations = expand_team_observations
         # SB3 asks for it through get_attr in its constructor; PettingZoo does not require it.
         self._declared_render_mode = declared(env, "render_mode")

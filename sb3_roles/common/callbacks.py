@@ -1,7 +1,7 @@
 """Callbacks of training, for every algorithm of SB3 and sb3-contrib on ``make_team_vec_env``.
 
-Their ``get_state()`` returns plain data, arrays, numbers and texts, from which ``set_state()``
-continues.
+``get_state()`` of those that keep records returns plain data, arrays, numbers and texts, from which
+``set_state()`` continues.
 """
 
 from sb3_roles.common.base_callback import (
@@ -11,6 +11,7 @@ from sb3_roles.common.base_callback import (
     role_wrapper_of,
 )
 from sb3_roles.common.metrics_callback import TeamEpisode, TeamMetricsCallback
+from sb3_roles.common.progress_callback import TeamProgressBar
 from sb3_roles.common.role_callback import RoleCallback, RoleEpisode
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "TeamCallback",
     "TeamEpisode",
     "TeamMetricsCallback",
+    "TeamProgressBar",
     "role_options",
     "role_wrapper_of",
 ]

@@ -245,8 +245,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
 class CheckpointFolder:
     """The last checkpoints of a run.
 
-    :param folder: made when it does not exist; remains of writers that were killed are removed
+    :param folder: where they are; see :meth:`prepare`
     :param keep: how many are kept, at least 2, so that one is left when the newest is damaged
+    :raises ValueError: if ``keep`` is below 2
     """
 
     def __init__(self, folder: Path, keep: int = 2) -> None:

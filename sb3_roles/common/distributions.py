@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 from torch import nn
@@ -33,6 +36,35 @@ def sample_index(log_probs: th.Tensor) -> th.Tensor:
     total = log_probs.exp().cumsum(1)
     uniform = th.rand(len(total), 1, device=total.device) * total[:, -1:]
     return (total <= uniform).sum(1).clamp(max=total.shape[1] - 1)
+
+
+def quantile_index(log_probs: th.Tensor, uniform: np.ndarray | None) -> np.ndarray:
+    """Take the entry of each row at a quantile of its distribution, or the likeliest one.
+
+    :param log_probs: float (n, k), up to a constant per row
+    :param uniform: float64 (n,) in [0, 1), the quantiles; None for the likeliest entries
+    :return: int64 (n,)
+    """
+    if uniform is None:
+        return log_probs.argmax(1).cpu().numpy()
+    total = log_probs.double().softmax(1).cumsum(1).cpu().numpy()
+    chosen = (total <= uniform[:, None] * total[:, -1:]).sum(axis=1)
+    return np.minimum(chosen, total.shape[1] - 1)
+
+
+def categorical_logits(distribution: Distribution) -> list[th.Tensor]:
+    """Return the parameters of a stock distribution over discrete actions, masks applied.
+
+    :param distribution: of Stable-Baselines3 or sb3-contrib
+    :return: float (n, k) for each of the action's entries
+    :raises ValueError: if actions are not discrete
+    """
+    # contrib's masked distributions over several entries have a list of their own.
+    made: Any = getattr(distribution, "distributions", None) or distribution.distribution
+    parts = made if isinstance(made, list) else [made]
+    if not all(isinstance(part, Categorical) for part in parts):
+        raise ValueError(f"actions must be discrete, not those of {type(distribution).__name__}")
+    return [part.logits for part in parts]
 
 
 def entropy(log_probs: th.Tensor) -> th.Tensor:
@@ -102,19 +134,23 @@ class RoleDistribution(Distribution):
         """Return the entropy of the pair in nats, float (n,)."""
         return self.distribution.entropy()
 
-    def _moves(self, roles: th.Tensor) -> th.Tensor:
+    def moves(self, roles: th.Tensor) -> th.Tensor:
+        """Return the moves' log-probabilities in the given roles, float (n, n_moves).
+
+        :param roles: int64 (n,)
+        """
         rows = th.arange(len(roles), device=roles.device)
         return self.move_log_probs[rows, roles]
 
     def sample(self) -> th.Tensor:
         """Draw a role and then a move, int64 (n, 2)."""
         roles = sample_index(self.role_log_probs)
-        return th.stack([roles, sample_index(self._moves(roles))], dim=1)
+        return th.stack([roles, sample_index(self.moves(roles))], dim=1)
 
     def mode(self) -> th.Tensor:
         """Return the most probable role and the most probable move in it, int64 (n, 2)."""
         roles = self.role_log_probs.argmax(1)
-        return th.stack([roles, self._moves(roles).argmax(1)], dim=1)
+        return th.stack([roles, self.moves(roles).argmax(1)], dim=1)
 
     def actions_from_params(
         self, role_log_probs: th.Tensor, move_log_probs: th.Tensor, deterministic: bool = False

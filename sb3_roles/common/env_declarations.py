@@ -1,12 +1,16 @@
 """What an environment declares about itself, its layers, and whether it can serve a team."""
 
 import io
+from collections.abc import Mapping
 from typing import Any
 
 import cloudpickle
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
+
+GoalNearness = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Goal set -> observation key, and index in a robot's array of that key."""
 
 
 def declared(env: object, name: str, default: Any = None) -> Any:
@@ -33,6 +37,34 @@ def declared_names(env: object, name: str) -> tuple[str, ...]:
     if isinstance(names, str):
         raise ValueError(f"{name} must be a tuple of strings, not {names!r}: write ({names!r},)")
     return tuple(names)
+
+
+def declared_goals(
+    env: object, space: spaces.Space, team_keys: tuple[str, ...] = ()
+) -> GoalNearness:
+    """
+    Where robots observe how near their goals are: the attribute ``goal_nearness``, ``{}`` without.
+
+    It names, for each goal set (``Role.goal_set``), one entry of the observation that is the larger
+    the nearer the nearest goal of the set is, and least when none is known. Of equally near goals
+    those of the set that is named first take precedence.
+
+    :param env: any environment
+    :param space: observation space of one robot
+    :param team_keys: keys that are shared by a team
+    :raises ValueError: if an entry is not in the observation of a robot
+    """
+    goals: GoalNearness = declared(env, "goal_nearness", {})
+    parts = space.spaces if isinstance(space, spaces.Dict) else {}
+    for name, (key, index) in goals.items():
+        shape = (parts[key].shape or ()) if key in parts and key not in team_keys else None
+        inside = shape is not None and len(index) == len(shape)
+        if not inside or any(not 0 <= i < n for i, n in zip(index, shape or (), strict=True)):
+            raise ValueError(
+                f"goal_nearness says that {name!r} is at {index} of the observation {key!r}, which "
+                f"no robot's observation has: {space}"
+            )
+    return goals
 
 
 def env_layers(env: object) -> list[object]:
@@ -62,12 +94,29 @@ def check_observation_space(space: spaces.Space, team_keys: tuple[str, ...]) -> 
             "Stable-Baselines3 takes simple spaces and a flat Dict of them as observations, not "
             f"{space}: flatten {nested or 'the Tuple'} into keys of one Dict"
         )
+    for key, part in (parts or {"": space}).items():
+        problem = _problem_of(part)
+        if problem is not None:
+            name = f"observation {key!r}" if key else "the observation"
+            raise ValueError(f"{name} is {part}, but policies read {problem}")
     unknown = [key for key in team_keys if key not in parts]
     if unknown:
         raise ValueError(
             f"team_observation_keys {unknown} are not keys of the observation space, which has "
             f"{list(parts) or 'none: it is not a Dict'}"
         )
+
+
+def _problem_of(space: spaces.Space) -> str | None:
+    """What policies could read instead of a space that Stable-Baselines3 makes no vector of."""
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim != 1:
+        return "MultiDiscrete of one dimension: flatten nvec"
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and np.any(space.start):
+        return f"choices that are counted from 0: subtract start={space.start}"
+    readable = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+    if not isinstance(space, readable):
+        return "Box, Discrete, MultiDiscrete and MultiBinary: encode it as one of them"
+    return None
 
 
 def check_homogeneous(env: ParallelEnv) -> None:

@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_roles.common.base_callback import TeamCallback, grown, role_wrapper_of, stacked
+from sb3_roles.common.checks import check_positive
 from sb3_roles.common.role_wrapper import STREAMS
+from sb3_roles.common.thresholds import first_above
 
 PAPER_CURVE = "explo_paper"
-_PAPER_THRESHOLD = 0.9
-# A mean of rounded fractions that is exactly 0.9 must not count as above it.
-_ROUNDING = 1e-12
 _TIME_PREFIX = "t90_"
 
 
@@ -37,6 +36,8 @@ class TeamMetricsCallback(TeamCallback):
     the mean is over the episodes that get there, ``t90_..._share`` is their share (``t90_share``
     that of ``t90_true``). ``time_e_paper`` is the first 0-based step at which the mean curve of
     ``explo_paper`` exceeds 0.9. ``team_episodes`` counts all episodes of the training.
+    ``time/env_steps`` and ``time/agent_steps`` are the steps of teams and of robots so far; SB3's
+    ``time/total_timesteps`` is the latter, too.
 
     :param window: episodes to average over
     :param verbose: see ``BaseCallback``
@@ -45,8 +46,8 @@ class TeamMetricsCallback(TeamCallback):
     def __init__(self, window: int = 100, verbose: int = 0) -> None:
         super().__init__(verbose)
         self.team_episodes = 0
+        check_positive(window=window)
         self.window: deque[TeamEpisode] = deque(maxlen=window)
-        self._running: dict[str, np.ndarray] = {}
 
     def _init_callback(self) -> None:
         super()._init_callback()
@@ -58,8 +59,6 @@ class TeamMetricsCallback(TeamCallback):
                 "returns": np.zeros((self.n_teams, n_streams)),
                 "curves": np.zeros((self.n_teams, 0)),
             }
-        for array in self._running.values():
-            array[self._begun()] = 0
 
     def _on_step(self) -> bool:
         running, steps = self._running, self._running["steps"]
@@ -120,10 +119,12 @@ class TeamMetricsCallback(TeamCallback):
             return None
         # An episode that ended early keeps its last value.
         full = [np.pad(c, (0, longest - len(c)), "edge") for c in curves if len(c)]
-        above = np.mean(full, axis=0) > _PAPER_THRESHOLD + _ROUNDING
-        return float(above.argmax()) if above.any() else None
+        time = int(first_above(np.mean(full, axis=0, keepdims=True))[0])
+        return None if time == longest else float(time)
 
     def _on_rollout_end(self) -> None:
+        self.logger.record("time/env_steps", self.joint_steps)
+        self.logger.record("time/agent_steps", int(self.model.num_timesteps))
         for name, value in self.summary().items():
             self.logger.record(f"rollout/{name}", value)
 

@@ -14,8 +14,8 @@ class BatchedTeamEnv(Protocol):
     """
     The batched form of an environment, what its ``batched(n_teams)`` returns.
 
-    Arrays may be overwritten in place by the next call; the caller copies. ``render_mode`` and
-    ``metadata`` are optional attributes.
+    Arrays may be overwritten in place by the next call; the caller copies. ``render_mode``,
+    ``metadata`` and ``goal_nearness`` are optional attributes.
     """
 
     n_teams: int
@@ -87,8 +87,8 @@ class NativeTeamVecEnv(TeamVecEnv):
 
     :param batched: the environment; not used by anyone else from here on
     :param expand_team_observations: see :class:`TeamVecEnv`
-    :param env: the environment that declares ``render_mode`` and ``metadata``, by default the
-        batched form itself
+    :param env: the environment that declares ``render_mode``, ``metadata`` and ``goal_nearness``,
+        by default the batched form itself
     :raises ValueError: if its observation space is not a flat Dict, or a team key is not in it
     """
 

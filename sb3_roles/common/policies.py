@@ -26,8 +26,8 @@ from sb3_roles.common.torch_layers import (
     make_map_encoder,
     map_style,
     resolve_precision,
-    symlog,
 )
+from sb3_roles.common.vectors import as_vectors, vector_size
 
 STATE_KEY = "state"
 POSITION_KEY = "position"
@@ -245,7 +245,7 @@ class TeamPolicy(ActorCriticPolicy):
         for key in keys:
             shape = self.observation_space[key].shape or ()
             if len(shape) != 3:
-                size += int(np.prod(shape))
+                size += vector_size(self.observation_space[key])
                 continue
             style = map_style(key, shape)
             name = self._encoder_name(owner, key)
@@ -276,10 +276,7 @@ class TeamPolicy(ActorCriticPolicy):
                     memo[name] = self.encoders[name](self._scaled(key, value))
                 part = memo[name]
             else:
-                part = value.reshape(len(value), -1).float()
-                space = self.observation_space[key]
-                if isinstance(space, spaces.Box) and not np.isfinite(space.high).all():
-                    part = symlog(part)
+                part = as_vectors(self.observation_space[key], value)
             if part.shape[0] != rows:
                 part = part.repeat_interleave(rows // part.shape[0], dim=0)
             parts.append(part)
@@ -288,7 +285,8 @@ class TeamPolicy(ActorCriticPolicy):
     def _scaled(self, key: str, maps: th.Tensor) -> th.Tensor:
         """Bring images to [0, 1]; maps of 0 and 1 stay the bytes that they are."""
         space = self.observation_space[key]
-        assert isinstance(space, spaces.Box)
+        if not isinstance(space, spaces.Box):
+            return maps
         high = float(space.high.max())
         return maps / high if space.dtype == np.uint8 and high > 1.0 else maps
 
@@ -297,6 +295,31 @@ class TeamPolicy(ActorCriticPolicy):
 
     def _autocast(self) -> th.autocast:
         return th.autocast(self.device.type, th.bfloat16, enabled=self._uses_bf16())
+
+    def goal_shape(
+        self, goal_key: str | None, goal_prior: float, n_moves: int
+    ) -> tuple[int, int] | None:
+        """Check a key whose rows are the features of sub-goals.
+
+        :param goal_key: None for none
+        :param goal_prior: not 0 if the first entries of a row are to be added to the moves' logits
+        :param n_moves: number of moves
+        :return: rows and their size
+        :raises ValueError: if the actors do not read the key, or its shape does not fit
+        """
+        if goal_key is None:
+            if goal_prior:
+                raise ValueError("goal_prior needs goal_key: it weighs the flags of that key")
+            return None
+        if goal_key not in self.actor_keys:
+            raise ValueError(closest("goal_key", goal_key, self.actor_keys))
+        shape = self.observation_space[goal_key].shape or ()
+        if len(shape) != 2 or (goal_prior and shape[1] < n_moves):
+            raise ValueError(
+                f"goal_key {goal_key!r} must have rows that begin with a flag for each of the "
+                f"{n_moves} moves, got shape {shape}"
+            )
+        return shape[0], shape[1]
 
     # Teams
 

@@ -9,14 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_roles.common.base_callback import (
-    TeamCallback,
-    csv_bytes,
-    grown,
-    role_wrapper_of,
-    stacked,
-    write_atomically,
-)
+from sb3_roles.common.base_callback import TeamCallback, grown, role_wrapper_of, stacked
+from sb3_roles.common.checks import check_positive
+from sb3_roles.common.files import csv_bytes, write_atomically
 
 _THIRDS = ("begin", "middle", "end")
 
@@ -47,8 +42,8 @@ class RoleCallback(TeamCallback):
         super().__init__(verbose)
         self.path = None if path is None else Path(path)
         self.role_names: tuple[str, ...] = ()
+        check_positive(window=window)
         self.window: deque[RoleEpisode] = deque(maxlen=window)
-        self._running: dict[str, np.ndarray] = {}
 
     def _init_callback(self) -> None:
         super()._init_callback()
@@ -64,8 +59,6 @@ class RoleCallback(TeamCallback):
                 "previous": np.zeros((self.n_teams, self.n_agents), np.int64),
                 "counts": np.zeros((self.n_teams, 0, len(self.role_names)), np.int64),
             }
-        for array in self._running.values():
-            array[self._begun()] = 0
 
     def _on_step(self) -> bool:
         if not self.role_names:

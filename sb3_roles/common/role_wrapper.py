@@ -11,8 +11,18 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_roles.common import roles as role_registry
+from sb3_roles.common.checks import check_positive
 from sb3_roles.common.names import closest
-from sb3_roles.common.roles import Role, get_roles, weight_vector
+from sb3_roles.common.role_rules import NearestRole
+from sb3_roles.common.roles import (
+    LEARNED,
+    NEAREST,
+    RANDOM,
+    Role,
+    get_roles,
+    role_controls,
+    weight_vector,
+)
 from sb3_roles.common.team_vec_env import team_seeds
 from sb3_roles.common.team_wrapper import TeamWrapper
 
@@ -32,7 +42,7 @@ class RoleWrapper(TeamWrapper):
     Observations get two more keys: ``role``, float32 (n_roles,), the role of the last step as a
     one-hot (all 0 at the start of an episode), and ``role_due``, float32 (1,): 1 when the role
     policy decides in this step, 0 when the role in ``role`` goes on. The role policy decides every
-    ``role_every`` steps of an episode. A controlled role (fixed or random) is never due.
+    ``role_every`` steps of an episode. A controlled role (fixed, random or by a rule) is never due.
 
     :param venv: an environment of ``make_team_vec_env``, possibly wrapped, with discrete actions
     :param roles: names of the role registry, or roles
@@ -42,10 +52,12 @@ class RoleWrapper(TeamWrapper):
     :param reward_sharing: whose components a robot is paid: ``"own"``, those of the robots that act
         in its role (``"same_role"``, the paper), or of the whole ``"team"``
     :param role_every: steps that a role lasts
-    :param role_control: ``"learned"``, ``"random"`` (uniform, every ``role_every`` steps) or the
-        name of the role that all robots act in. Random roles are a function of the seed of
-        ``seed()``, the team, and the numbers of episode and step
-    :raises ValueError: if an option is unknown or out of range, or the actions are not discrete
+    :param role_control: ``"learned"``, ``"random"`` (uniform, every ``role_every`` steps),
+        ``"nearest"`` (the role whose goal is nearest, every ``role_every`` steps, see
+        ``NearestRole``) or the name of the role that all robots act in. Random roles are a function
+        of the seed of ``seed()``, the team, and the numbers of episode and step
+    :raises ValueError: if an option is unknown or out of range, the actions are not discrete, or
+        the environment does not observe what ``"nearest"`` needs
     """
 
     def __init__(
@@ -56,15 +68,14 @@ class RoleWrapper(TeamWrapper):
         primitive_weights: str | Mapping[str, Mapping[str, float]] = "identity",
         reward_sharing: str = "own",
         role_every: int = 1,
-        role_control: str = "learned",
+        role_control: str = LEARNED,
     ) -> None:
         self.roles = get_roles(roles)
         self.role_names = tuple(role.name for role in self.roles)
         if reward_sharing not in REWARD_SHARING:
             raise ValueError(closest("reward_sharing", reward_sharing, REWARD_SHARING))
-        if isinstance(role_every, bool) or not isinstance(role_every, int) or role_every < 1:
-            raise ValueError(f"role_every must be a whole number from 1, got {role_every!r}")
-        controls = ("learned", "random", *self.role_names)
+        check_positive(role_every=role_every)
+        controls = role_controls(self.role_names)
         if role_control not in controls:
             raise ValueError(closest("role_control", role_control, controls))
         if not isinstance(venv.action_space, spaces.Discrete):
@@ -83,6 +94,8 @@ class RoleWrapper(TeamWrapper):
         self.reward_sharing = reward_sharing
         self.role_every = role_every
         self.role_control = role_control
+        nearest = role_control == NEAREST
+        self._rule = NearestRole(self.roles, self.team_env.goal_nearness) if nearest else None
         pending = [seed for seed in self.team_env._seeds[:: self.n_agents] if seed is not None]
         seeds = pending or team_seeds(0, self.n_teams)
         self._role_seeds = np.array(seeds, np.uint64)
@@ -98,8 +111,8 @@ class RoleWrapper(TeamWrapper):
         }
 
     def _extra_observations(self) -> dict[str, np.ndarray]:
-        due = self._episode_steps % self.role_every == 0
-        if self.role_control != "learned":
+        due = self._decides()
+        if self.role_control != LEARNED:
             due = np.zeros_like(due)
         one_hot = self.current_roles[:, None] == np.arange(len(self.roles))
         return {
@@ -107,13 +120,23 @@ class RoleWrapper(TeamWrapper):
             ROLE_DUE_KEY: due[:, None].astype(np.float32),
         }
 
-    def _control_roles(self) -> None:
-        """Set the roles that are not learned, for the coming step."""
-        if self.role_control == "learned":
+    def _decides(self) -> np.ndarray:
+        """Bool (num_envs,): whether a role is chosen in the coming step."""
+        return self._episode_steps % self.role_every == 0
+
+    def _control_roles(self, observations: Any) -> None:
+        """Set the roles that are not learned, for the coming step.
+
+        :param observations: what the robots see, of the environment
+        """
+        if self.role_control == LEARNED:
             return
-        if self.role_control == "random":
-            due = self._episode_steps % self.role_every == 0
-            self.current_roles = np.where(due, self._random_roles(), self.current_roles)
+        if self.role_control == RANDOM:
+            self.current_roles = np.where(self._decides(), self._random_roles(), self.current_roles)
+        elif self._rule is not None:
+            self.current_roles = np.where(
+                self._decides(), self._rule(observations), self.current_roles
+            )
         else:
             self.current_roles[:] = self.role_names.index(self.role_control)
 
@@ -152,7 +175,7 @@ class RoleWrapper(TeamWrapper):
         self._episode_steps[:] = 0
         self.stream_rewards = np.zeros_like(self.stream_rewards)
         observations = self.venv.reset()
-        self._control_roles()
+        self._control_roles(observations)
         return self._extend(observations)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -203,7 +226,7 @@ class RoleWrapper(TeamWrapper):
         self._episode_steps[dones] = 0
         self._episodes[dones[:: self.n_agents]] += np.uint64(1)
         self.current_roles = np.where(dones, -1, self.current_roles)
-        self._control_roles()
+        self._control_roles(observations)
         return self._extend(observations), self.stream_rewards[:, 0].copy(), dones, infos
 
     def _share(self, components: np.ndarray) -> np.ndarray:

@@ -30,6 +30,16 @@ class Role:
 
 ROLES: dict[str, Role] = {}
 
+LEARNED, RANDOM, NEAREST = "learned", "random", "nearest"
+
+
+def role_controls(role_names: Sequence[str]) -> tuple[str, ...]:
+    """Return what ``role_control`` may be: who chooses the roles, or the only role there is.
+
+    :param role_names: of the roles in use
+    """
+    return (LEARNED, RANDOM, NEAREST, *role_names)
+
 
 def register_role(role: Role) -> Role:
     """Add a role to the registry.

@@ -6,6 +6,7 @@ extractor for actor and critic, so that neither reads the state.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from torch import nn
 from sb3_roles.common.policies import POSITION_KEY, STATE_KEY
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, RoleWrapper
 from sb3_roles.common.team_wrapper import AGENT_KEY
-from sb3_roles.common.torch_layers import CHANNELS, MapEncoder, map_style, symlog
+from sb3_roles.common.torch_layers import CHANNELS, MapEncoder, map_style
+from sb3_roles.common.vectors import compressed, vector_size
 
 _NOT_SEEN = (STATE_KEY, POSITION_KEY, AGENT_KEY, ROLE_DUE_KEY)
 
@@ -35,7 +37,6 @@ class OwnViewExtractor(BaseFeaturesExtractor):
     def __init__(self, observation_space: spaces.Dict) -> None:
         encoders: dict[str, nn.Module] = {}
         size = 0
-        self._unbounded = set()
         for key, space in observation_space.spaces.items():
             shape = space.shape or ()
             if key in _NOT_SEEN:
@@ -47,22 +48,22 @@ class OwnViewExtractor(BaseFeaturesExtractor):
                 size += encoder.out_features
             else:
                 encoders[key] = nn.Flatten()
-                size += int(np.prod(shape))
-                if not np.isfinite(space.high).all():  # type: ignore[attr-defined]
-                    self._unbounded.add(key)
+                size += vector_size(space)
         super().__init__(observation_space, size)
         self.encoders = nn.ModuleDict(encoders)
 
     def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
         """Encode rows.
 
-        :param observations: float tensors by key, (n, ...)
+        :param observations: float tensors by key, (n, ...); SB3 has made one-hots of discrete ones
         :return: float (n, features_dim)
         """
+        boxes = self._observation_space.spaces  # type: ignore[attr-defined]
         parts = []
         for key, encoder in self.encoders.items():
             part = encoder(observations[key].float())
-            parts.append(symlog(part) if key in self._unbounded else part)
+            is_map = isinstance(encoder, MapEncoder)
+            parts.append(part if is_map else compressed(boxes[key], part))
         return th.cat(parts, dim=1)
 
 
@@ -99,6 +100,30 @@ def open_moves(local: np.ndarray) -> np.ndarray:
     for move, (dy, dx) in enumerate(((-1, 0), (0, 1), (1, 0), (0, -1)), start=1):
         allowed[:, move] = local[:, 0, center + dy, center + dx] == 0
     return allowed
+
+
+def row_masks(
+    observations: Mapping[str, np.ndarray], action_space: spaces.Space, blocked_moves: bool
+) -> np.ndarray:
+    """Return what rows may choose: a role that goes on is the only one, and moves that are open.
+
+    :param observations: key -> (n, ...)
+    :param action_space: ``MultiDiscrete`` of role and move, or ``Discrete`` moves
+    :param blocked_moves: the environment is area search, whose blocked moves are known; others
+        allow all moves
+    :return: bool (n, n_roles + n_moves)
+    """
+    n = len(next(iter(observations.values())))
+    parts = []
+    if isinstance(action_space, spaces.MultiDiscrete):
+        parts.append((observations[ROLE_DUE_KEY] > 0.5) | (observations[ROLE_KEY] > 0.5))
+        n_moves = int(action_space.nvec[-1])
+    else:
+        assert isinstance(action_space, spaces.Discrete)
+        n_moves = int(action_space.n)
+    allowed = np.ones((n, n_moves), np.bool_)
+    parts.append(open_moves(observations["local"]) if blocked_moves else allowed)
+    return np.concatenate(parts, axis=1)
 
 
 class OwnViewWrapper(VecEnvWrapper):
@@ -143,15 +168,11 @@ class MaskWrapper(OwnViewWrapper):
     def __init__(self, venv: RoleWrapper, blocked_moves: bool) -> None:
         super().__init__(venv)
         assert isinstance(venv.action_space, spaces.MultiDiscrete)
-        self._n_roles, self._n_moves = (int(n) for n in venv.action_space.nvec)
         self._blocked_moves = blocked_moves
-        self.masks = np.ones((self.num_envs, self._n_roles + self._n_moves), bool)
+        self.masks = np.ones((self.num_envs, int(venv.action_space.nvec.sum())), np.bool_)
 
     def _look(self, observations: Any) -> Any:
-        held = observations[ROLE_DUE_KEY] < 0.5
-        self.masks[:, : self._n_roles] = ~held | (observations[ROLE_KEY] > 0.5)
-        if self._blocked_moves:
-            self.masks[:, self._n_roles :] = open_moves(observations["local"])
+        self.masks = row_masks(observations, self.action_space, self._blocked_moves)
         return observations
 
     def reset(self) -> Any:

@@ -96,10 +96,21 @@ def _env_state(env: VecEnv) -> dict[str, Any]:
     return {"teams": teams, "wrappers": layers}
 
 
+def _begin_anew(model: OnPolicyAlgorithm, env: VecEnv) -> None:
+    """Start new episodes, of streams that are a function of the run's seed and of where it is.
+
+    With the seed alone, a resumed run would play the first episodes of the run again. What the
+    wrappers, an LSTM and the callbacks knew of the episodes that were cut off does not hold.
+    """
+    if model.seed is not None:
+        env_steps = model.num_timesteps // find_team_env(env).n_agents
+        words = np.random.SeedSequence([model.seed, env_steps]).generate_state(1)
+        env.seed(int(words[0]))
+    model._last_obs = env.reset()  # type: ignore[assignment]
+    model._last_episode_starts = np.ones(env.num_envs, np.bool_)
+
+
 def _set_env_state(env: VecEnv, state: Mapping[str, Any]) -> None:
-    if state["teams"] is None:
-        # New episodes begin: what the wrappers knew of the old ones does not hold.
-        return
     team_env, rows = find_team_env(env), _team_rows(env)
     if len(state["teams"]) != len(rows):
         raise CheckpointError("the environments' state is of another number of teams")
@@ -255,11 +266,13 @@ def restore(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
         model.start_time = time.time_ns() - int(state["elapsed_ns"])
         if state["kl_coefs"]:
             model.kl_coefs = [float(one) for one in state["kl_coefs"]]  # type: ignore[attr-defined]
-        _set_env_state(model.env, state["env"])
-        if state["env"]["teams"] is not None:
+        if state["env"]["teams"] is None:
+            _begin_anew(model, model.env)
+        else:
+            _set_env_state(model.env, state["env"])
             _set_observations(model, state)
-        if state["lstm"] is not None and state["env"]["teams"] is not None:
-            _set_lstm(model, state["lstm"])
+            if state["lstm"] is not None:
+                _set_lstm(model, state["lstm"])
         window = model._stats_window_size
         model.ep_info_buffer = deque(state["ep_info"], maxlen=window)
         model.ep_success_buffer = deque(state["ep_success"], maxlen=window)

@@ -164,9 +164,10 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
     """
     A :class:`TeamVecEnv` over copies of a PettingZoo ``ParallelEnv``, made by SuperSuit.
 
-    Optional attributes of the environment: ``team_observation_keys``, ``reward_component_names``,
-    ``metric_names``. With the last two, ``infos[agent]`` of every step holds
-    ``"reward_components"`` and ``"metrics"`` (the same for all agents), each a dict name -> float.
+    Optional attributes of the environment: ``team_observation_keys``, ``goal_nearness``,
+    ``reward_component_names``, ``metric_names``. With the last two, ``infos[agent]`` of every step
+    holds ``"reward_components"`` and ``"metrics"`` (the same for all agents), each a dict
+    name -> float.
 
     All copies run in this process: SuperSuit's workers are slower for cheap environments, share
     seeds, and hang the interpreter at exit.

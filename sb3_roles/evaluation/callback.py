@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,10 +12,14 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_roles.common.base_callback import Evaluate, TeamCallback, csv_bytes, write_atomically
+from sb3_roles.common.base_callback import Evaluate, TeamCallback
+from sb3_roles.common.checkpoint import write_checkpoint
+from sb3_roles.common.checks import check_positive
+from sb3_roles.common.files import csv_bytes, write_atomically
 from sb3_roles.common.names import closest
 from sb3_roles.evaluation.evaluators import make_evaluator
 
+WEIGHTS_FILE = "model.ckpt"
 Save = Callable[[BaseAlgorithm, Path, Mapping[str, Any]], None]
 
 
@@ -36,21 +39,18 @@ def random_state_kept() -> Iterator[None]:
 
 
 def save_policy(model: BaseAlgorithm, folder: Path, record: Mapping[str, Any]) -> None:
-    """Write ``policy.safetensors``, the weights of a model's policy, and ``best.json``.
+    """Write the weights of a model's policy to ``model.ckpt``, a checkpoint of weights only.
+
+    ``common.checkpoint.read_checkpoint`` reads it, and ``common.snapshot.load_weights`` puts the
+    weights into a model; in a run folder, ``load_model(run, best=True)`` does both.
 
     :param model: any SB3 model
     :param folder: where to write; made if it does not exist
-    :param record: what is known of the weights, numbers and texts
+    :param record: what is known of the weights, numbers and texts; the manifest's ``record``
     """
-    # Not a requirement of the callback itself: ``save`` may be another function.
-    from safetensors.torch import save
-
-    weights = {
-        name: value.detach().cpu().clone(memory_format=th.contiguous_format)
-        for name, value in model.policy.state_dict().items()
-    }
-    write_atomically(folder / "policy.safetensors", save(weights))
-    write_atomically(folder / "best.json", (json.dumps(dict(record), indent=2) + "\n").encode())
+    folder.mkdir(parents=True, exist_ok=True)
+    manifest = {"record": dict(record), "agent_steps": int(model.num_timesteps)}
+    write_checkpoint(folder / WEIGHTS_FILE, manifest, model.policy.state_dict())
 
 
 class EvaluationCallback(TeamCallback):
@@ -87,9 +87,7 @@ class EvaluationCallback(TeamCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        for name, value in (("eval_freq", eval_freq), ("n_episodes", n_episodes)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        check_positive(eval_freq=eval_freq, n_episodes=n_episodes)
         self.eval_freq = eval_freq
         self.n_episodes = n_episodes
         self.seed = seed
@@ -153,6 +151,12 @@ class EvaluationCallback(TeamCallback):
             rows = [[row.get(name, "") for name in names] for row in self.history]
             write_atomically(self.folder / "evaluations.csv", csv_bytes(names, rows))
         return scores
+
+    def close(self) -> None:
+        """Release what the evaluation has open, such as its environment; nothing follows it."""
+        close = getattr(self.evaluate, "close", None)
+        if close is not None:
+            close()
 
     def get_state(self) -> dict[str, Any]:
         """Return what the coming evaluations and records depend on."""

@@ -2,47 +2,77 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import platform
+import sys
 import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from area_search import kernels
 from area_search.batch import BatchedAreaSearch
 from area_search.scenes import Scene, get_scene
+from sb3_roles._version import __version__
+from sb3_roles.evaluation.records import COUNTS, NO_ROLE, EpisodeRecords, distance_type, held
 
 if TYPE_CHECKING:
-    from sb3_roles.baselines.base import Controller, States
+    from sb3_roles.baselines.base import Controller
 
-NEVER = kernels.NEVER
-METRICS = kernels.METRICS
-NO_ROLE = -1
+# Seeds of training teams have 32 bits, see ``team_seeds``: no stream from here on is one of them.
+HELD_OUT = 2**32
+_VERSIONS = ("numpy", "numba", "torch")
 
 
-# Without eq=False the generated comparison would ask for the truth value of whole arrays.
-@dataclass(frozen=True, eq=False)
-class EpisodeRecords:
-    """What was measured in E episodes of one scene; row e of every array is one episode.
+def held_out_seed(seed: int) -> int:
+    """Return the seed of a stream of area-search episodes that no training run plays.
 
-    :param episode: int64 (E,), number of the episode in the stream of the seed
-    :param length: int64 (E,), joint steps until the episode ended
-    :param curves: ``explo_paper``, ``explo_true``, ``cover`` -> float64 (E, horizon), fractions;
-        index t holds the value after step t + 1, and from the end on the last value
-    :param t90_true: int64 (E,), 0-based first step with explo_true >= 0.9, -1 for never
-    :param t90_paper: int64 (E,), 0-based first step with explo_paper > 0.9, -1 for never
-    :param seconds: wall time of the simulation, compilation excluded
-    :param roles: int8 (E, horizon, N), role of each robot in step t + 1; -1 after the end of the
-        episode, and everywhere for controllers without roles
+    :param seed: of the evaluation, at least 0
     """
+    return HELD_OUT + seed
 
-    episode: np.ndarray
-    length: np.ndarray
-    curves: dict[str, np.ndarray]
-    t90_true: np.ndarray
-    t90_paper: np.ndarray
-    seconds: float
-    roles: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0), np.int8))
+
+def describe(controller: Controller, scene: Scene, name: str | None = None) -> dict[str, Any]:
+    """Say who plays what: all that decides about the results but the seed and the episodes.
+
+    A controller may have the attributes ``name`` and ``description``, a dict of JSON values which
+    tells it from others of its class; and ``deterministic`` and ``communicate``, where it has such
+    a choice.
+
+    :param controller: see :class:`~sb3_roles.baselines.base.Controller`
+    :param scene: the task
+    :param name: a label; by default the controller's, or that of its class
+    :return: ``name``; ``controller`` (its class), ``controller_options``, ``scene`` (its fields),
+        ``deterministic`` and ``communication`` (None: no such choice), ``version`` of the package;
+        and ``config_hash``, the sha256 of canonical JSON of all these but ``name``
+    :raises ValueError: if the description is not made of JSON values
+    """
+    config = {
+        "controller": type(controller).__name__,
+        "controller_options": getattr(controller, "description", {}),
+        "scene": asdict(scene),
+        "deterministic": getattr(controller, "deterministic", None),
+        "communication": getattr(controller, "communicate", None),
+        "version": __version__,
+    }
+    try:
+        text = json.dumps(config, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the description of {config['controller']} is no JSON: {error}") from None
+    if name is None:
+        name = str(getattr(controller, "name", config["controller"]))
+    # What was written, not what was given: tuples have become lists, as in a file.
+    return {
+        "name": name,
+        **json.loads(text),
+        "config_hash": hashlib.sha256(text.encode()).hexdigest(),
+    }
+
+
+def _versions() -> dict[str, str]:
+    loaded = {name: sys.modules[name].__version__ for name in _VERSIONS if name in sys.modules}
+    return {"python": platform.python_version(), **loaded}
 
 
 class Player:
@@ -50,60 +80,43 @@ class Player:
 
     :param controller: see :class:`~sb3_roles.baselines.base.Controller`
     :param batch: the teams; the caller reads the outcome of a step from it
-    :param deterministic: handed to the controller
+    :raises ValueError: if the controller has no ``begin``
     """
 
-    def __init__(
-        self, controller: Controller, batch: BatchedAreaSearch, deterministic: bool = False
-    ) -> None:
-        self._controller, self._batch = controller, batch
-        self._deterministic = deterministic
-        self._uses_observation = getattr(controller, "uses_observation", True)
-        self._state: States | None = None
-        self._episode_start = np.ones(batch.n_teams * batch.n_agents, np.bool_)
+    def __init__(self, controller: Controller, batch: BatchedAreaSearch) -> None:
         begin = getattr(controller, "begin", None)
-        if begin is not None:
-            begin(batch)
+        if begin is None:
+            raise ValueError(
+                f"{type(controller).__name__} has no begin(batch), which a controller of episodes "
+                "must have: evaluation.policies.PolicyController makes one of an SB3 model"
+            )
+        self._controller, self._batch = controller, batch
+        self.decision_seconds = 0.0
+        """Time that the controller took to decide on the last step, for the whole batch."""
+        begin(batch)
 
     def step(self) -> None:
         """Choose actions for all teams and step them.
 
         :raises ValueError: if the controller does not return one action for each row
         """
-        batch, rows = self._batch, len(self._episode_start)
-        observation = row_observations(batch) if self._uses_observation else {}
-        actions, self._state = self._controller.predict(
-            observation, self._state, self._episode_start, self._deterministic
-        )
+        batch = self._batch
+        start = time.perf_counter()
+        actions, _ = self._controller.predict({})
+        self.decision_seconds = time.perf_counter() - start
+        rows = batch.n_teams * batch.n_agents
         if actions.shape != (rows,):
             raise ValueError(
                 f"{type(self._controller).__name__}.predict returned actions of shape "
                 f"{actions.shape}, expected ({rows},): one for each of {batch.n_teams} teams x "
                 f"{batch.n_agents} robots"
             )
-        self._episode_start[:] = False
         batch.step(actions.reshape(batch.n_teams, batch.n_agents))
 
     @property
     def roles(self) -> np.ndarray | None:
         """Int8 (n_teams, n_agents), the roles of the last step, if the controller has any."""
         return getattr(self._controller, "roles", None)
-
-
-def row_observations(batch: BatchedAreaSearch) -> dict[str, np.ndarray]:
-    """Return the observations with one row per robot, contiguous by team, as SB3 models take them.
-
-    :param batch: the teams
-    :return: key -> (n_teams * n_agents, ...); maps of a team are repeated, the other arrays are
-        views that the next step overwrites
-    """
-    rows = {}
-    for key, value in batch.observations.items():
-        if key in batch.team_observation_keys:
-            rows[key] = np.repeat(value, batch.n_agents, axis=0)
-        else:
-            rows[key] = value.reshape(batch.n_teams * batch.n_agents, *value.shape[2:])
-    return rows
 
 
 def run_episodes(
@@ -114,12 +127,16 @@ def run_episodes(
     first_episode: int = 0,
     batch_size: int = 256,
     sub_goal: str | None = None,
-    deterministic: bool = False,
+    *,
+    n_agents: int | None = None,
+    name: str | None = None,
 ) -> EpisodeRecords:
     """Play episodes ``first_episode`` .. ``first_episode + n_episodes - 1`` of a seed's stream.
 
-    With a controller whose actions are a function of the episode, as those of all scripted ones
-    are, the records do not depend on ``batch_size``, nor on how episodes are split over calls.
+    Controllers act as a function of the episode alone, so the records depend neither on
+    ``batch_size`` nor on how episodes are split over calls, and two controllers that are given the
+    same seed play the same episodes. Training plays streams of seeds below 2 ** 32:
+    :func:`held_out_seed` makes one that no training plays.
 
     :param controller: see :class:`~sb3_roles.baselines.base.Controller`
     :param scene: the task
@@ -129,72 +146,79 @@ def run_episodes(
     :param batch_size: teams that are simulated together
     :param sub_goal: path features in the observation, see ``area_search.paths``; by default those
         that the controller names in its own ``sub_goal``, or none
-    :param deterministic: handed to the controller
+    :param n_agents: robots in the team, instead of the scene's
+    :param name: what the records call the controller, see :func:`describe`
     :return: the records, in the order of the episodes
     :raises ValueError: if a number is out of range
     """
-    scene = get_scene(scene)
-    for name, value, low in (
+    scene = get_scene(scene) if n_agents is None else get_scene(scene, n_agents=n_agents)
+    for what, value, low in (
         ("n_episodes", n_episodes, 1),
         ("first_episode", first_episode, 0),
         ("batch_size", batch_size, 1),
     ):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
-            raise ValueError(f"{name} must be a whole number of at least {low}, got {value!r}")
-    shape = (n_episodes, scene.horizon)
-    records = EpisodeRecords(
-        episode=np.arange(first_episode, first_episode + n_episodes, dtype=np.int64),
-        length=np.zeros(n_episodes, np.int64),
-        curves={name: np.zeros(shape) for name in METRICS},
-        t90_true=np.full(n_episodes, NEVER, np.int64),
-        t90_paper=np.full(n_episodes, NEVER, np.int64),
-        seconds=0.0,
-        roles=np.full((*shape, scene.n_agents), NO_ROLE, np.int8),
-    )
+            raise ValueError(f"{what} must be a whole number of at least {low}, got {value!r}")
     if sub_goal is None:
         sub_goal = str(getattr(controller, "sub_goal", "none"))
-    _warm_up(controller, scene, seed, sub_goal)
+    metadata = describe(controller, scene, name)
+    # A step of one team compiles the kernels, or loads them.
+    batch = BatchedAreaSearch(scene, 1, sub_goal)
+    batch.reset([seed], first_episode)
+    Player(controller, batch).step()
+    records = _empty(scene, n_episodes, first_episode)
     start = time.perf_counter()
-    batch: BatchedAreaSearch | None = None
     for low in range(0, n_episodes, batch_size):
         rows = slice(low, min(low + batch_size, n_episodes))
         episodes = records.episode[rows]
-        if batch is None or batch.n_teams != len(episodes):
+        if batch.n_teams != len(episodes):
             batch = BatchedAreaSearch(scene, len(episodes), sub_goal)
         batch.reset([seed] * len(episodes), episodes)
-        _play(Player(controller, batch, deterministic), batch, records, rows)
-    object.__setattr__(records, "seconds", time.perf_counter() - start)
+        player = Player(controller, batch)
+        _play(player, batch, records, rows)
+    records.timing.update(seconds=time.perf_counter() - start, batch_size=int(batch_size))
+    names = [] if player.roles is None else list(getattr(controller, "role_names", ()))
+    records.metadata.update(metadata, seed=int(seed), role_names=names, versions=_versions())
     return records
 
 
-def _warm_up(controller: Controller, scene: Scene, seed: int, sub_goal: str) -> None:
-    # Compiles the kernels. A learned controller is not asked: it would advance its generator.
-    batch = BatchedAreaSearch(scene, 1, sub_goal)
-    batch.reset([seed], 0)
-    if hasattr(controller, "begin"):
-        Player(controller, batch).step()
-    else:
-        batch.step(np.zeros((1, scene.n_agents), np.int64))
+def _empty(scene: Scene, n_episodes: int, first_episode: int) -> EpisodeRecords:
+    shape = (n_episodes, scene.horizon)
+    return EpisodeRecords(
+        metadata={},
+        episode=np.arange(first_episode, first_episode + n_episodes, dtype=np.int64),
+        length=np.zeros(n_episodes, np.int64),
+        counts={name: np.zeros(shape, np.int32) for name in COUNTS},
+        n_free=np.full(n_episodes, scene.n_free, np.int32),
+        n_targets=np.full(n_episodes, scene.n_targets, np.int32),
+        distance=np.zeros((*shape, scene.n_agents), distance_type(scene.horizon)),
+        roles=np.full((*shape, scene.n_agents), NO_ROLE, np.int8),
+        decision_seconds=np.full(shape, np.nan, np.float32),
+        timing={},
+    )
 
 
 def _play(player: Player, batch: BatchedAreaSearch, records: EpisodeRecords, rows: slice) -> None:
     # Ended teams go on moving, because the batch steps as a whole; nothing of it is recorded.
     playing = np.ones(batch.n_teams, np.bool_)
+    length, distance = records.length[rows], records.distance[rows]
+    moved = np.zeros((batch.n_teams, batch.n_agents), distance.dtype)
     for t in range(batch.scene.horizon):
+        before = batch.position.copy()
         player.step()
-        for name, values in batch.metrics.items():
-            curve = records.curves[name][rows]
-            curve[:, t] = values if t == 0 else np.where(playing, values, curve[:, t - 1])
+        moved += (batch.position != before).any(axis=2)
+        distance[:, t] = moved
+        for name, column in COUNTS.items():
+            records.counts[name][rows, t] = batch.totals[:, column]
         if player.roles is not None:
             records.roles[rows][playing, t] = player.roles[playing]
+        records.decision_seconds[rows][playing, t] = player.decision_seconds / playing.sum()
         ended = playing & (batch.terminated | batch.truncated)
-        if not ended.any():
-            continue
-        records.length[rows][ended] = t + 1
-        records.t90_true[rows][ended] = batch.totals[ended, kernels.T90_TRUE]
-        records.t90_paper[rows][ended] = batch.totals[ended, kernels.T90_PAPER]
+        length[ended] = t + 1
         playing &= ~ended
         if not playing.any():
-            for curves in records.curves.values():
-                curves[rows, t + 1 :] = curves[rows, t : t + 1]
-            return
+            break
+    if length.min() < batch.scene.horizon:
+        distance[:] = held(distance, length)
+        for counts in records.counts.values():
+            counts[rows] = held(counts[rows], length)

@@ -6,26 +6,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from area_search.scenes import Scene, get_scene
 from sb3_roles.common.callbacks import Evaluate
 from sb3_roles.common.team_wrapper import find_team_env
-from sb3_roles.evaluation.episodes import run_episodes
-from sb3_roles.evaluation.metrics import first_above, t90
+from sb3_roles.common.thresholds import first_above
+from sb3_roles.evaluation.episodes import held_out_seed, run_episodes
+from sb3_roles.evaluation.metrics import t90
 from sb3_roles.evaluation.policies import PolicyController
-
-# Seeds of training teams have 32 bits, see ``team_seeds``: no stream from here on is one of them.
-_HELD_OUT = 2**32
-
-
-def held_out_seed(seed: int) -> int:
-    """Return the seed of a stream of area-search episodes that no training run plays.
-
-    :param seed: of the evaluation, at least 0
-    """
-    return _HELD_OUT + seed
 
 
 class SceneEvaluator:
@@ -80,14 +72,19 @@ class SceneEvaluator:
             scores["t90_true"] = mean
         return {**scores, "t90_share": share, "n_episodes": float(self.n_episodes)}
 
+    def close(self) -> None:
+        """Nothing is open."""
+
 
 class VecEnvEvaluator:
     """Plays team episodes of any environment, always the same ones.
 
     Each team plays an equal share of the episodes, so that short episodes are not preferred.
 
+    A policy with masks is given those of the environment, as in training.
+
     :param env: a vectorized environment of its own (not the one that is trained on), wrapped as
-        that one is
+        that one is; :meth:`close` closes it
     :param n_episodes: team episodes
     :param seed: of the environment; streams of training seeds differ from it
     :param deterministic: handed to ``predict``
@@ -109,6 +106,9 @@ class VecEnvEvaluator:
         :return: ``return`` (sum over the robots of a team), ``length``, the numbers in the
             environment's ``episode_metrics``, and ``n_episodes``; means
         """
+        masked = isinstance(model.policy, MaskableActorCriticPolicy) and is_masking_supported(
+            self.env
+        )
         teams, agents = self.team_env.n_teams, self.team_env.n_agents
         # VecEnv.reset() takes the seeds once: the next evaluation plays the same episodes.
         self.env.seed(held_out_seed(self.seed))
@@ -118,7 +118,8 @@ class VecEnvEvaluator:
         episodes: list[dict[str, float]] = []
         state, starts = None, np.ones(teams * agents, np.bool_)
         while left.any():
-            actions, state = model.predict(observations, state, starts, self.deterministic)
+            masks = {"action_masks": get_action_masks(self.env)} if masked else {}
+            actions, state = model.predict(observations, state, starts, self.deterministic, **masks)
             observations, rewards, starts, infos = self.env.step(actions)
             returns += np.asarray(rewards).reshape(teams, agents).sum(axis=1)
             length += 1
@@ -136,6 +137,10 @@ class VecEnvEvaluator:
             for name in names
         }
         return {**scores, "n_episodes": float(len(episodes))}
+
+    def close(self) -> None:
+        """Release the environment."""
+        self.env.close()
 
 
 def make_evaluator(

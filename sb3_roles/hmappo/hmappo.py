@@ -10,16 +10,12 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_roles.common.checks import check_not_negative, check_unit
 from sb3_roles.common.policies import TeamPolicy
 from sb3_roles.common.role_wrapper import RoleWrapper, role_wrapper_of
 from sb3_roles.common.team_wrapper import TeamWrapper
 from sb3_roles.hmappo.policies import RoleActorCriticPolicy
-from sb3_roles.mappo.mappo import (
-    MAPPO,
-    StreamSettings,
-    _check_not_negative,
-    _check_unit,
-)
+from sb3_roles.mappo.mappo import MAPPO, StreamSettings
 
 
 class HMAPPO(MAPPO):
@@ -66,11 +62,11 @@ class HMAPPO(MAPPO):
         self.role_ent_coef = self.ent_coef if role_ent_coef is None else role_ent_coef
         self.role_vf_coef = self.vf_coef if role_vf_coef is None else role_vf_coef
         self.role_kl_coef = self.kl_coef if role_kl_coef is None else role_kl_coef
-        _check_unit(role_gamma=self.role_gamma, role_gae_lambda=self.role_gae_lambda)
-        _check_not_negative(role_vf_coef=self.role_vf_coef, role_kl_coef=self.role_kl_coef)
+        check_unit(role_gamma=self.role_gamma, role_gae_lambda=self.role_gae_lambda)
+        check_not_negative(role_vf_coef=self.role_vf_coef, role_kl_coef=self.role_kl_coef)
         for name in ("role_clip_range", "role_ent_coef"):
             if not callable(getattr(self, name)):
-                _check_not_negative(**{name: getattr(self, name)})
+                check_not_negative(**{name: getattr(self, name)})
         if _init_setup_model:
             self._setup_model()
 

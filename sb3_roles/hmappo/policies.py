@@ -40,6 +40,12 @@ class RoleActorCriticPolicy(TeamPolicy):
     :param primitive_input: ``"own"``: those keys only (the paper); ``"graph"``: the role actor's
         features behind the graph, too
     :param primitive_arch: hidden layers of the primitive actor
+    :param goal_key: observation key with one row per role, such as area search's ``sub_goal``: the
+        primitive actor reads the row of its role and of no other one (the sub-goal of the paper's
+        GA-POMDP, Section IV); None gives the whole key to whoever reads it
+    :param goal_prior: first weight, learned from there on, that the first ``n_moves`` entries of
+        that row have in the logits of the moves. They flag the moves towards the sub-goal: with a
+        weight above 0, an untrained primitive actor heads for the sub-goal of its role
     :param value_arch: hidden layers of both critics
     :param see_role: give the role that is going on to the role actor and the critics; for roles
         that last several steps
@@ -60,6 +66,8 @@ class RoleActorCriticPolicy(TeamPolicy):
         primitive_keys: Sequence[str] | None = None,
         primitive_input: str = "own",
         primitive_arch: Sequence[int] = (64, 32),
+        goal_key: str | None = None,
+        goal_prior: float = 0.0,
         value_arch: Sequence[int] = (64, 32),
         see_role: bool = False,
         **options: Any,
@@ -81,6 +89,8 @@ class RoleActorCriticPolicy(TeamPolicy):
         self.primitive_keys = None if primitive_keys is None else tuple(primitive_keys)
         self.primitive_input = primitive_input
         self.primitive_arch = tuple(primitive_arch)
+        self.goal_key = goal_key
+        self.goal_prior = goal_prior
         self.value_arch = tuple(value_arch)
         self.see_role = see_role
         self.n_roles, self.n_moves = (int(n) for n in action_space.nvec)  # type: ignore[attr-defined]
@@ -93,6 +103,8 @@ class RoleActorCriticPolicy(TeamPolicy):
             "primitive_keys",
             "primitive_input",
             "primitive_arch",
+            "goal_key",
+            "goal_prior",
             "value_arch",
             "see_role",
         )
@@ -106,6 +118,8 @@ class RoleActorCriticPolicy(TeamPolicy):
         for key in keys:
             if key not in self.actor_keys:
                 raise ValueError(closest("key in primitive_keys", key, self.actor_keys))
+        if self.goal_key is not None:
+            keys = tuple(key for key in keys if key != self.goal_key)
         self._move_keys = keys
         seen = self.n_roles if self.see_role else 0
 
@@ -119,7 +133,15 @@ class RoleActorCriticPolicy(TeamPolicy):
 
         own = self._add_encoders("primitive", keys)
         own += size if self.primitive_input == "graph" else 0
-        self.action_net = RoleHead(own, self.n_roles, self.primitive_arch, self.n_moves, gain=0.01)
+        self.action_net = RoleHead(
+            own,
+            self.n_roles,
+            self.primitive_arch,
+            self.n_moves,
+            gain=0.01,
+            goal_features=self._goal_features(),
+            goal_prior=self.goal_prior,
+        )
 
         size = self._add_encoders("value_role", self.critic_keys) + seen
         self.role_value_net = Head(size, self.value_arch, 1, gain=1.0)
@@ -128,6 +150,25 @@ class RoleActorCriticPolicy(TeamPolicy):
             size, self.n_roles, self.value_arch, 1, gain=1.0
         )
         self.action_dist = RoleDistribution()
+
+    def _goal_features(self) -> int:
+        """Return the size of a role's row of ``goal_key``, 0 without; check that it is one."""
+        shape = self.goal_shape(self.goal_key, self.goal_prior, self.n_moves)
+        if shape is None:
+            return 0
+        if shape[0] != self.n_roles:
+            raise ValueError(
+                f"goal_key {self.goal_key!r} must have one row for each of the {self.n_roles} "
+                f"roles, got shape {shape}"
+            )
+        return shape[1]
+
+    def _move_log_probs(
+        self, own: th.Tensor, roles: th.Tensor | None, obs: Observation
+    ) -> th.Tensor:
+        """Return log p(move | role), (n, n_moves) for given roles or (n, n_roles, n_moves)."""
+        goals = None if self.goal_key is None else obs[self.goal_key].float()
+        return F.log_softmax(self.action_net(own, roles, goals).float(), dim=-1)
 
     def _with_role(self, features: th.Tensor, obs: Observation) -> th.Tensor:
         return th.cat([features, obs[ROLE_KEY]], dim=1) if self.see_role else features
@@ -175,7 +216,7 @@ class RoleActorCriticPolicy(TeamPolicy):
                 roles = role_log_probs.argmax(1) if deterministic else sample_index(role_log_probs)
             else:
                 roles = actions[:, 0]
-            move_log_probs = F.log_softmax(self.action_net(own, roles).float(), dim=1)
+            move_log_probs = self._move_log_probs(own, roles, obs)
             role_values = self._role_values(obs, memo)
             critic = self._encode("value_primitive", self.critic_keys, obs, memo)
             move_values = self.value_net(critic, None if choose else roles).float()
@@ -201,7 +242,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         """Return the joint distribution over role and move of whole teams."""
         with self._autocast():
             role_log_probs, own = self._actor_features(obs, {})  # type: ignore[arg-type]
-            move_log_probs = F.log_softmax(self.action_net(own).float(), dim=2)
+            move_log_probs = self._move_log_probs(own, None, obs)  # type: ignore[arg-type]
         return RoleDistribution().proba_distribution(role_log_probs, move_log_probs)
 
     def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:

@@ -16,6 +16,7 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance, ob
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_roles.common.buffers import TeamRolloutBuffer
+from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
 from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
 from sb3_roles.common.policies import TeamPolicy
 from sb3_roles.common.team_wrapper import AGENT_KEY, TeamWrapper, find_team_env
@@ -130,9 +131,9 @@ class MAPPO(OnPolicyAlgorithm):
         self.kl_target = kl_target
         self.target_kl = target_kl
         self.kl_coefs: list[float] = []
-        _check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs)
-        _check_unit(gamma=gamma, gae_lambda=gae_lambda)
-        _check_not_negative(vf_coef=vf_coef, kl_coef=kl_coef, kl_target=kl_target)
+        check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs)
+        check_unit(gamma=gamma, gae_lambda=gae_lambda)
+        check_not_negative(vf_coef=vf_coef, kl_coef=kl_coef, kl_target=kl_target)
         for name, value in (("max_grad_norm", max_grad_norm), ("target_kl", target_kl)):
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
             if value is not None and not (number and value > 0):
@@ -143,7 +144,7 @@ class MAPPO(OnPolicyAlgorithm):
             ("ent_coef", ent_coef),
         ):
             if not callable(schedule):
-                _check_not_negative(**{name: schedule})
+                check_not_negative(**{name: schedule})
         if _init_setup_model:
             self._setup_model()
 
@@ -341,14 +342,6 @@ class MAPPO(OnPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/optimizer_steps", n_steps, exclude="tensorboard")
 
-    def dump_logs(self, iteration: int = 0) -> None:
-        """Write the log, with time counted in steps of teams and of robots."""
-        assert self.env is not None
-        n_agents = find_team_env(self.env).n_agents
-        self.logger.record("time/env_steps", self.num_timesteps // n_agents)
-        self.logger.record("time/agent_steps", self.num_timesteps)
-        super().dump_logs(iteration)
-
     def learn(
         self: SelfMAPPO,
         total_timesteps: int,
@@ -370,22 +363,3 @@ class MAPPO(OnPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-
-
-def _check_positive(**values: int) -> None:
-    for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
-
-
-def _check_unit(**values: float) -> None:
-    for name, value in values.items():
-        if not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
-            raise ValueError(f"{name} must be a number in [0, 1], got {value!r}")
-
-
-def _check_not_negative(**values: Any) -> None:
-    for name, value in values.items():
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not 0.0 <= value < float("inf"):
-            raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")

@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
 from torch.nn import functional as F
 
 from sb3_roles.common.distributions import sample_index
@@ -25,6 +26,10 @@ class TeamActorCriticPolicy(TeamPolicy):
     :param actor_arch: layers before the graph
     :param head_arch: hidden layers behind the graph
     :param value_arch: hidden layers of the critic
+    :param goal_key: observation key with rows of features, such as area search's ``sub_goal``
+    :param goal_prior: first weight, a parameter per row of ``goal_key``, with which the first
+        entries of these rows (a flag per move) are added to the logits: above 0, an untrained
+        actor heads for the sub-goals; the counterpart of ``RoleActorCriticPolicy``'s
     :param options: see :class:`~sb3_roles.common.policies.TeamPolicy`
     :raises ValueError: if the action space is not discrete, or an option is unknown
     """
@@ -40,6 +45,8 @@ class TeamActorCriticPolicy(TeamPolicy):
         actor_arch: Sequence[int] = (128, 64),
         head_arch: Sequence[int] = (64, 32),
         value_arch: Sequence[int] = (64, 32),
+        goal_key: str | None = None,
+        goal_prior: float = 0.0,
         **options: Any,
     ) -> None:
         if not isinstance(action_space, spaces.Discrete):
@@ -47,13 +54,15 @@ class TeamActorCriticPolicy(TeamPolicy):
         self.actor_arch = tuple(actor_arch)
         self.head_arch = tuple(head_arch)
         self.value_arch = tuple(value_arch)
+        self.goal_key = goal_key
+        self.goal_prior = goal_prior
         super().__init__(observation_space, action_space, lr_schedule, **options)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        archs = ("actor_arch", "head_arch", "value_arch")
+        names = ("actor_arch", "head_arch", "value_arch", "goal_key", "goal_prior")
         return {
             **super()._get_constructor_parameters(),
-            **{name: getattr(self, name) for name in archs},
+            **{name: getattr(self, name) for name in names},
         }
 
     def _build_networks(self) -> None:
@@ -64,10 +73,17 @@ class TeamActorCriticPolicy(TeamPolicy):
         if self.graph:
             self.actor_graph = GraphLayer(size, self.graph_width)
             size = self.graph_width
-        self.action_net = Head(size, self.head_arch, int(self.action_space.n), gain=0.01)
+        n_moves = int(self.action_space.n)
+        self.action_net = Head(size, self.head_arch, n_moves, gain=0.01)
+        goals = self.goal_shape(self.goal_key, self.goal_prior, n_moves)
+        self.goal_weights = (
+            nn.Parameter(th.full((goals[0],), self.goal_prior))
+            if goals and self.goal_prior
+            else None
+        )
         size = self._add_encoders("value_primitive", self.critic_keys)
         self.value_net = Head(size, self.value_arch, 1, gain=1.0)  # type: ignore[assignment]
-        self.action_dist = CategoricalDistribution(int(self.action_space.n))
+        self.action_dist = CategoricalDistribution(n_moves)
 
     def _log_probs(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:
         n_agents = self.team_size(obs)
@@ -76,7 +92,11 @@ class TeamActorCriticPolicy(TeamPolicy):
             graph = self._graph(obs, features, n_agents)
             teams = features.view(-1, n_agents, features.shape[1])
             features = self.actor_graph(teams, graph).flatten(0, 1)
-        return F.log_softmax(self.action_net(features).float(), dim=1)
+        logits = self.action_net(features).float()
+        if self.goal_weights is not None:
+            flags = obs[self.goal_key][:, :, : logits.shape[1]].float()  # type: ignore[index]
+            logits = logits + (self.goal_weights.unsqueeze(1) * flags).sum(1)
+        return F.log_softmax(logits, dim=1)
 
     def _values(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:
         return self.value_net(self._encode("value_primitive", self.critic_keys, obs, memo)).float()

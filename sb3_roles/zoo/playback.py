@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,6 +71,25 @@ def play_scene(
         roles.append(nobody if player.roles is None else player.roles[0].copy())
         draw()
     return batch.episode_metrics(0), np.array(roles)
+
+
+def draw_last(controller: Controller, scene: Scene, seed: int, episode: int, path: Path) -> None:
+    """Draw the last frame of an episode into a file.
+
+    :param controller: who acts
+    :param scene: the task
+    :param seed: of the stream of episodes
+    :param episode: its number in the stream
+    :param path: a PNG file
+    """
+    import pygame
+
+    frames: deque[np.ndarray] = deque(maxlen=1)
+    links = bool(getattr(controller, "communicate", True))
+    play_scene(controller, scene, seed, episode, frames.append, links)
+    image = io.BytesIO()
+    pygame.image.save(pygame.surfarray.make_surface(frames[0].swapaxes(0, 1)), image, "frame.png")
+    path.write_bytes(image.getvalue())
 
 
 def play_env(
