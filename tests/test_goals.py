@@ -16,25 +16,23 @@ def distribution(policy, obs):
         return policy.get_distribution(obs)
 
 
-def with_row(obs, role, seed):
-    """The same observation with other features of one role's sub-goal."""
-    th.manual_seed(seed)
-    changed = {key: value.clone() for key, value in obs.items()}
-    changed["sub_goal"][:, role] = th.rand_like(changed["sub_goal"][:, role]) * 5
-    return changed
-
-
-def test_a_move_depends_on_the_sub_goal_of_its_role_only():
-    policy = make_policy("hmappo", goal_key="sub_goal", goal_prior=1.5)
+def test_a_role_weighs_its_own_sub_goal_and_those_of_others():
+    options = {"goal_key": "sub_goal", "goal_prior": 3.0, "other_goal_prior": 0.5}
+    policy = make_policy("hmappo", **options)
     obs = make_observation(3, 4)
-    moves = distribution(policy, obs).move_log_probs
-    assert moves.shape == (12, 2, N_MOVES)
-    changed = distribution(policy, with_row(obs, EXPLORE, 1)).move_log_probs
-    assert th.equal(moves[:, COVER], changed[:, COVER])
-    assert (moves[:, EXPLORE] - changed[:, EXPLORE]).abs().max() > 1e-2
-    # The role actor chooses between the sub-goals: it sees both.
-    roles = distribution(policy, obs).role_log_probs
-    assert (roles - distribution(policy, with_row(obs, COVER, 2)).role_log_probs).abs().max() > 1e-4
+    obs["sub_goal"][:, :, :N_MOVES] = 0.0
+    before = distribution(policy, obs).move_log_probs
+    # The networks read the flags, too: without them only the weights are left.
+    with th.no_grad():
+        for parameter in policy.action_net.features.parameters():
+            parameter.zero_()
+    plain = distribution(policy, obs).move_log_probs
+    assert before.shape == plain.shape == (12, 2, N_MOVES)
+    obs["sub_goal"][:, EXPLORE, 2] = 1.0
+    ratio = distribution(policy, obs).move_log_probs - plain
+    gain = ratio[..., 2] - ratio[..., 0]
+    th.testing.assert_close(gain[:, EXPLORE], th.full((12,), 3.0))
+    th.testing.assert_close(gain[:, COVER], th.full((12,), 0.5))
 
 
 def test_one_role_and_all_roles_are_the_same_function():
@@ -52,6 +50,8 @@ def untrained(model_class, prior, **roles):
     env = small_search(8, sub_goal="nearest", **roles)
     name = "RolePolicy" if roles else "TeamPolicy"
     options = {"goal_key": "sub_goal", "goal_prior": prior}
+    if roles:
+        options["other_goal_prior"] = 0.0
     return model_class(name, env, n_steps=10, batch_size=16, seed=0, policy_kwargs=options)
 
 
@@ -81,20 +81,19 @@ def test_without_roles_it_heads_for_both_sub_goals():
     assert best.float().mean() > 0.99
 
 
-def test_the_weight_of_the_sub_goal_is_learned():
+def test_the_weights_of_the_sub_goals_are_learned():
     for model in (untrained(HMAPPO, 2.0, roles={}), untrained(MAPPO, 2.0)):
-        parameters = dict(model.policy.named_parameters())
-        (name,) = [name for name in parameters if "goal_prior" in name or "goal_weights" in name]
-        assert parameters[name].tolist() == [2.0, 2.0]
+        weights = model.policy.goal_net.weights
+        before = weights.detach().clone()
+        assert before.diagonal().eq(2.0).all() if before.ndim == 2 else before.eq(2.0).all()
         model.learn(8 * 3 * 10)
-        assert all(abs(weight - 2.0) > 1e-5 for weight in parameters[name].tolist())
+        assert (weights - before).abs().min() > 1e-5
 
 
 @pytest.mark.parametrize("kind", ["hmappo", "mappo"])
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"goal_prior": 1.0}, "goal_prior needs goal_key"),
         ({"goal_key": "sub_gaol"}, "did you mean 'sub_goal'?"),
         ({"goal_key": "local"}, "rows"),
         ({"goal_key": "position"}, "unknown goal_key"),

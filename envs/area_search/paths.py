@@ -64,8 +64,8 @@ def search_scratch(sub_goal: str, n_agents: int, area: int) -> tuple[np.ndarray,
     return (
         *common,
         np.zeros((n_agents, area), np.int32),  # lists
-        np.zeros((3, n_agents), np.int64),  # counts
-        np.zeros(n_agents, np.int64),  # cursor
+        np.zeros(n_agents, np.int64),  # visited
+        np.zeros((n_agents, 4), np.int64),  # ends, see area_search.matching
         np.zeros(n_agents, np.int64),  # chosen
         np.zeros(area, np.uint8),  # blocked
         np.zeros(area, np.int32),  # owner
@@ -73,6 +73,49 @@ def search_scratch(sub_goal: str, n_agents: int, area: int) -> tuple[np.ndarray,
         np.zeros(N_ACTIONS, np.int64),  # territory
         np.zeros(n_agents, np.int64),  # source
     )
+
+
+@njit(cache=True, inline="always")
+def start_at(start: int, distance: np.ndarray, moves: np.ndarray, queue: np.ndarray) -> int:
+    """Begin a search at a robot's cell: visit it; return the number of visited cells."""
+    moves[start] = 1
+    distance[start] = 0
+    queue[0] = start
+    return 1
+
+
+@njit(cache=True, inline="always")
+def expand(
+    cells: np.ndarray,
+    stride: int,
+    cell: int,
+    distance: np.ndarray,
+    moves: np.ndarray,
+    queue: np.ndarray,
+    tail: int,
+) -> int:
+    """Visit the known free neighbors of a cell; the arrays are those of :func:`search`.
+
+    Once all cells of the queue before a cell are expanded, its first moves are complete.
+
+    :param tail: number of visited cells
+    :return: number of visited cells
+    """
+    d = distance[cell]
+    mask = moves[cell]
+    for action in range(1, N_ACTIONS):
+        neighbor = cell + MOVE_ROWS[action] * stride + MOVE_COLUMNS[action]
+        if cells[neighbor] & (EXPLORED | OBSTACLE) != EXPLORED:
+            continue
+        first = np.uint8(1 << action) if d == 0 else mask
+        if moves[neighbor] == 0:
+            moves[neighbor] = first
+            distance[neighbor] = d + 1
+            queue[tail] = neighbor
+            tail += 1
+        elif distance[neighbor] == d + 1:
+            moves[neighbor] |= first
+    return tail
 
 
 @njit(cache=True)
@@ -104,10 +147,7 @@ def search(
     """
     nearest[:, 0] = -1
     nearest[:, 1] = 0
-    moves[start] = 1
-    distance[start] = 0
-    queue[0] = start
-    head, tail = 0, 1
+    head, tail = 0, start_at(start, distance, moves, queue)
     wanted = (n_goals[0] > 0) + (n_goals[1] > 0)
     left = n_goals[0] + n_goals[1]
     last = -1
@@ -130,18 +170,7 @@ def search(
             nearest[1, 0] = d
             nearest[1, 1] |= mask
             last = d
-        for action in range(1, N_ACTIONS):
-            neighbor = cell + MOVE_ROWS[action] * stride + MOVE_COLUMNS[action]
-            if cells[neighbor] & (EXPLORED | OBSTACLE) != EXPLORED:
-                continue
-            first = np.uint8(1 << action) if d == 0 else mask
-            if moves[neighbor] == 0:
-                moves[neighbor] = first
-                distance[neighbor] = d + 1
-                queue[tail] = neighbor
-                tail += 1
-            elif distance[neighbor] == d + 1:
-                moves[neighbor] |= first
+        tail = expand(cells, stride, cell, distance, moves, queue, tail)
     return tail
 
 

@@ -13,6 +13,11 @@ if TYPE_CHECKING:
 # Names are cheap; the classes import numba, or more, and are loaded when they are asked for.
 _HOME = {
     "random": "sb3_roles.baselines.random:RandomController",
+    "greedy": "sb3_roles.baselines.greedy:GreedyController",
+    "greedy_assigned": "sb3_roles.baselines.greedy:GreedyAssignedController",
+    "vrpc": "sb3_roles.baselines.vrpc:VRPController",
+    "planner": "sb3_roles.baselines.vrpc:RoutePlanner",
+    "oracle": "sb3_roles.baselines.oracle:OracleController",
 }
 CONTROLLER_NAMES = tuple(_HOME)
 CONTROLLERS: dict[str, type[ScriptedController]]

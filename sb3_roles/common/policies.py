@@ -296,30 +296,25 @@ class TeamPolicy(ActorCriticPolicy):
     def _autocast(self) -> th.autocast:
         return th.autocast(self.device.type, th.bfloat16, enabled=self._uses_bf16())
 
-    def goal_shape(
-        self, goal_key: str | None, goal_prior: float, n_moves: int
-    ) -> tuple[int, int] | None:
-        """Check a key whose rows are the features of sub-goals.
+    def _count_goals(self, goal_key: str | None, n_moves: int) -> int:
+        """Check a key whose rows begin with flags of the moves towards sub-goals.
 
         :param goal_key: None for none
-        :param goal_prior: not 0 if the first entries of a row are to be added to the moves' logits
         :param n_moves: number of moves
-        :return: rows and their size
+        :return: number of rows
         :raises ValueError: if the actors do not read the key, or its shape does not fit
         """
         if goal_key is None:
-            if goal_prior:
-                raise ValueError("goal_prior needs goal_key: it weighs the flags of that key")
-            return None
+            return 0
         if goal_key not in self.actor_keys:
             raise ValueError(closest("goal_key", goal_key, self.actor_keys))
         shape = self.observation_space[goal_key].shape or ()
-        if len(shape) != 2 or (goal_prior and shape[1] < n_moves):
+        if len(shape) != 2 or shape[1] < n_moves:
             raise ValueError(
                 f"goal_key {goal_key!r} must have rows that begin with a flag for each of the "
                 f"{n_moves} moves, got shape {shape}"
             )
-        return shape[0], shape[1]
+        return shape[0]
 
     # Teams
 

@@ -274,9 +274,6 @@ class RoleHead(nn.Module):
     :param widths: sizes of the hidden layers, at least one
     :param out_features: size of the output
     :param gain: scale of the output layer's orthogonal initialization
-    :param goal_features: size of a role's own features, which are concatenated, too; 0 for none
-    :param goal_prior: first weight, a parameter per role, with which the first ``out_features`` of
-        a role's own features are added to the output; 0 for no such parameter
     """
 
     def __init__(
@@ -286,8 +283,6 @@ class RoleHead(nn.Module):
         widths: Sequence[int],
         out_features: int,
         gain: float,
-        goal_features: int = 0,
-        goal_prior: float = 0.0,
     ) -> None:
         super().__init__()
         if not widths:
@@ -295,44 +290,44 @@ class RoleHead(nn.Module):
         self.features = nn.Linear(in_features, widths[0])
         self.role = nn.Linear(n_roles, widths[0], bias=False)
         self.head = Head(widths[0], widths[1:], out_features, gain)
-        self.goal = nn.Linear(goal_features, widths[0], bias=False) if goal_features else None
-        self.goal_prior = (
-            nn.Parameter(th.full((n_roles,), goal_prior)) if goal_features and goal_prior else None
-        )
-        self.out_features = out_features
 
-    def forward(
-        self,
-        x: th.Tensor,
-        roles: th.Tensor | None = None,
-        goals: th.Tensor | None = None,
-    ) -> th.Tensor:
+    def forward(self, x: th.Tensor, roles: th.Tensor | None = None) -> th.Tensor:
         """Evaluate for one role per row, or for all of them.
 
         :param x: float (n, in_features)
         :param roles: int64 (n,); None for all roles
-        :param goals: float (n, n_roles, goal_features), each role's own features, if it has any
         :return: float (n, out_features), or (n, n_roles, out_features)
         """
         first = self.features(x)
         if roles is None:
-            mine = goals
-            weight = self.goal_prior
-            first = first.unsqueeze(1) + self.role.weight.t().to(first.dtype)
-        else:
-            # A product with one-hots: the backward pass of indexing is ten times slower.
-            one_hot = F.one_hot(roles, self.role.in_features).to(first.dtype)
-            mine = None if goals is None else (one_hot.unsqueeze(2) * goals).sum(1)
-            weight = None if self.goal_prior is None else one_hot @ self.goal_prior
-            first = first + self.role(one_hot)
-        if self.goal is not None:
-            assert mine is not None
-            first = first + self.goal(mine)
-        out = self.head(F.relu(first))
-        if weight is not None:
-            assert mine is not None
-            out = out + weight.unsqueeze(-1) * mine[..., : self.out_features]
-        return out
+            by_role = self.role.weight.t().to(first.dtype)
+            return self.head(F.relu(first.unsqueeze(1) + by_role))
+        # A product with one-hots: the backward pass of indexing is ten times slower.
+        one_hot = F.one_hot(roles, self.role.in_features).to(first.dtype)
+        return self.head(F.relu(first + self.role(one_hot)))
+
+
+class GoalPrior(nn.Module):
+    """Logits that favor the moves towards sub-goals, with a learned weight for each sub-goal.
+
+    :param weights: first weights, float (n_goals,), or (n_roles, n_goals) if they differ by role
+    """
+
+    def __init__(self, weights: th.Tensor) -> None:
+        super().__init__()
+        self.weights = nn.Parameter(weights)
+
+    def forward(self, flags: th.Tensor, roles: th.Tensor | None = None) -> th.Tensor:
+        """Weigh the moves.
+
+        :param flags: float (n, n_goals, n_moves), 1 for a move with which a shortest path begins
+        :param roles: int64 (n,), if the weights differ by role; None for all roles
+        :return: float (n, n_moves), or (n, n_roles, n_moves)
+        """
+        if self.weights.ndim == 1 or roles is None:
+            return th.einsum("...g,ngm->n...m", self.weights, flags)
+        one_hot = F.one_hot(roles, len(self.weights)).to(flags.dtype)
+        return th.bmm((one_hot @ self.weights).unsqueeze(1), flags).squeeze(1)
 
 
 class GraphLayer(nn.Module):

@@ -19,7 +19,7 @@ from sb3_roles.common.distributions import (
 from sb3_roles.common.names import closest
 from sb3_roles.common.policies import Observation, Streams, TeamPolicy
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, STREAMS
-from sb3_roles.common.torch_layers import GraphLayer, Head, RoleHead, mlp
+from sb3_roles.common.torch_layers import GoalPrior, GraphLayer, Head, RoleHead, mlp
 
 PRIMITIVE_INPUTS = ("own", "graph")
 
@@ -40,12 +40,12 @@ class RoleActorCriticPolicy(TeamPolicy):
     :param primitive_input: ``"own"``: those keys only (the paper); ``"graph"``: the role actor's
         features behind the graph, too
     :param primitive_arch: hidden layers of the primitive actor
-    :param goal_key: observation key with one row per role, such as area search's ``sub_goal``: the
-        primitive actor reads the row of its role and of no other one (the sub-goal of the paper's
-        GA-POMDP, Section IV); None gives the whole key to whoever reads it
-    :param goal_prior: first weight, learned from there on, that the first ``n_moves`` entries of
-        that row have in the logits of the moves. They flag the moves towards the sub-goal: with a
-        weight above 0, an untrained primitive actor heads for the sub-goal of its role
+    :param goal_key: observation key with one row per role that begins with flags of the moves
+        towards that role's sub-goal, such as area search's ``sub_goal`` (the sub-goals of the
+        paper's GA-POMDP, Section IV); None for no such logits
+    :param goal_prior: first weight, learned from there on, of the flags of a robot's own role in
+        the moves' logits: above 0, an untrained robot heads for the sub-goal of its role
+    :param other_goal_prior: the same for the flags of the other roles
     :param value_arch: hidden layers of both critics
     :param see_role: give the role that is going on to the role actor and the critics; for roles
         that last several steps
@@ -67,7 +67,8 @@ class RoleActorCriticPolicy(TeamPolicy):
         primitive_input: str = "own",
         primitive_arch: Sequence[int] = (64, 32),
         goal_key: str | None = None,
-        goal_prior: float = 0.0,
+        goal_prior: float = 2.0,
+        other_goal_prior: float = 1.0,
         value_arch: Sequence[int] = (64, 32),
         see_role: bool = False,
         **options: Any,
@@ -91,6 +92,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         self.primitive_arch = tuple(primitive_arch)
         self.goal_key = goal_key
         self.goal_prior = goal_prior
+        self.other_goal_prior = other_goal_prior
         self.value_arch = tuple(value_arch)
         self.see_role = see_role
         self.n_roles, self.n_moves = (int(n) for n in action_space.nvec)  # type: ignore[attr-defined]
@@ -105,6 +107,7 @@ class RoleActorCriticPolicy(TeamPolicy):
             "primitive_arch",
             "goal_key",
             "goal_prior",
+            "other_goal_prior",
             "value_arch",
             "see_role",
         )
@@ -118,8 +121,6 @@ class RoleActorCriticPolicy(TeamPolicy):
         for key in keys:
             if key not in self.actor_keys:
                 raise ValueError(closest("key in primitive_keys", key, self.actor_keys))
-        if self.goal_key is not None:
-            keys = tuple(key for key in keys if key != self.goal_key)
         self._move_keys = keys
         seen = self.n_roles if self.see_role else 0
 
@@ -133,15 +134,8 @@ class RoleActorCriticPolicy(TeamPolicy):
 
         own = self._add_encoders("primitive", keys)
         own += size if self.primitive_input == "graph" else 0
-        self.action_net = RoleHead(
-            own,
-            self.n_roles,
-            self.primitive_arch,
-            self.n_moves,
-            gain=0.01,
-            goal_features=self._goal_features(),
-            goal_prior=self.goal_prior,
-        )
+        self.action_net = RoleHead(own, self.n_roles, self.primitive_arch, self.n_moves, gain=0.01)
+        self.goal_net = self._make_goal_net()
 
         size = self._add_encoders("value_role", self.critic_keys) + seen
         self.role_value_net = Head(size, self.value_arch, 1, gain=1.0)
@@ -151,24 +145,27 @@ class RoleActorCriticPolicy(TeamPolicy):
         )
         self.action_dist = RoleDistribution()
 
-    def _goal_features(self) -> int:
-        """Return the size of a role's row of ``goal_key``, 0 without; check that it is one."""
-        shape = self.goal_shape(self.goal_key, self.goal_prior, self.n_moves)
-        if shape is None:
-            return 0
-        if shape[0] != self.n_roles:
+    def _make_goal_net(self) -> GoalPrior | None:
+        n_goals = self._count_goals(self.goal_key, self.n_moves)
+        if not n_goals:
+            return None
+        if n_goals != self.n_roles:
             raise ValueError(
                 f"goal_key {self.goal_key!r} must have one row for each of the {self.n_roles} "
-                f"roles, got shape {shape}"
+                f"roles, got {n_goals} rows"
             )
-        return shape[1]
+        own = th.eye(self.n_roles)
+        return GoalPrior(own * self.goal_prior + (1.0 - own) * self.other_goal_prior)
 
     def _move_log_probs(
         self, own: th.Tensor, roles: th.Tensor | None, obs: Observation
     ) -> th.Tensor:
         """Return log p(move | role), (n, n_moves) for given roles or (n, n_roles, n_moves)."""
-        goals = None if self.goal_key is None else obs[self.goal_key].float()
-        return F.log_softmax(self.action_net(own, roles, goals).float(), dim=-1)
+        logits = self.action_net(own, roles).float()
+        if self.goal_net is not None:
+            flags = obs[self.goal_key][:, :, : self.n_moves]  # type: ignore[index]
+            logits = logits + self.goal_net(flags.float(), roles)
+        return F.log_softmax(logits, dim=-1)
 
     def _with_role(self, features: th.Tensor, obs: Observation) -> th.Tensor:
         return th.cat([features, obs[ROLE_KEY]], dim=1) if self.see_role else features

@@ -9,12 +9,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.type_aliases import Schedule
-from torch import nn
 from torch.nn import functional as F
 
 from sb3_roles.common.distributions import sample_index
 from sb3_roles.common.policies import Observation, Streams, TeamPolicy
-from sb3_roles.common.torch_layers import GraphLayer, Head, mlp
+from sb3_roles.common.torch_layers import GoalPrior, GraphLayer, Head, mlp
 
 
 class TeamActorCriticPolicy(TeamPolicy):
@@ -26,10 +25,10 @@ class TeamActorCriticPolicy(TeamPolicy):
     :param actor_arch: layers before the graph
     :param head_arch: hidden layers behind the graph
     :param value_arch: hidden layers of the critic
-    :param goal_key: observation key with rows of features, such as area search's ``sub_goal``
-    :param goal_prior: first weight, a parameter per row of ``goal_key``, with which the first
-        entries of these rows (a flag per move) are added to the logits: above 0, an untrained
-        actor heads for the sub-goals; the counterpart of ``RoleActorCriticPolicy``'s
+    :param goal_key: observation key whose rows begin with flags of the moves towards a sub-goal,
+        such as area search's ``sub_goal``; None for no such logits
+    :param goal_prior: first weight, learned from there on, of these flags in the moves' logits:
+        above 0, an untrained robot heads for its sub-goals, most where one move serves several
     :param options: see :class:`~sb3_roles.common.policies.TeamPolicy`
     :raises ValueError: if the action space is not discrete, or an option is unknown
     """
@@ -46,7 +45,7 @@ class TeamActorCriticPolicy(TeamPolicy):
         head_arch: Sequence[int] = (64, 32),
         value_arch: Sequence[int] = (64, 32),
         goal_key: str | None = None,
-        goal_prior: float = 0.0,
+        goal_prior: float = 2.0,
         **options: Any,
     ) -> None:
         if not isinstance(action_space, spaces.Discrete):
@@ -75,12 +74,8 @@ class TeamActorCriticPolicy(TeamPolicy):
             size = self.graph_width
         n_moves = int(self.action_space.n)
         self.action_net = Head(size, self.head_arch, n_moves, gain=0.01)
-        goals = self.goal_shape(self.goal_key, self.goal_prior, n_moves)
-        self.goal_weights = (
-            nn.Parameter(th.full((goals[0],), self.goal_prior))
-            if goals and self.goal_prior
-            else None
-        )
+        n_goals = self._count_goals(self.goal_key, n_moves)
+        self.goal_net = GoalPrior(th.full((n_goals,), self.goal_prior)) if n_goals else None
         size = self._add_encoders("value_primitive", self.critic_keys)
         self.value_net = Head(size, self.value_arch, 1, gain=1.0)  # type: ignore[assignment]
         self.action_dist = CategoricalDistribution(n_moves)
@@ -93,9 +88,9 @@ class TeamActorCriticPolicy(TeamPolicy):
             teams = features.view(-1, n_agents, features.shape[1])
             features = self.actor_graph(teams, graph).flatten(0, 1)
         logits = self.action_net(features).float()
-        if self.goal_weights is not None:
-            flags = obs[self.goal_key][:, :, : logits.shape[1]].float()  # type: ignore[index]
-            logits = logits + (self.goal_weights.unsqueeze(1) * flags).sum(1)
+        if self.goal_net is not None:
+            flags = obs[self.goal_key][:, :, : logits.shape[1]]  # type: ignore[index]
+            logits = logits + self.goal_net(flags.float())
         return F.log_softmax(logits, dim=1)
 
     def _values(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:
