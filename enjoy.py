@@ -1,6 +1,7 @@
-"""Watch a trained policy, see ``python enjoy.py --help``."""
+"""Watch a trained policy: ``python enjoy.py --help``."""
 
-from sb3_roles.zoo.enjoy import main
+from sb3_roles.zoo.cli import main
 
+# Processes that are spawned import this file again.
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(script="enjoy"))

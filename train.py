@@ -1,7 +1,7 @@
 """Train an algorithm: ``python train.py --help``."""
 
-import sys
+from sb3_roles.zoo.cli import main
 
-from sb3_roles.zoo.train import main
-
-sys.exit(main())
+# Processes that are spawned import this file again.
+if __name__ == "__main__":
+    raise SystemExit(main(script="train"))

@@ -19,6 +19,8 @@ from sb3_roles.zoo.options import key_value, parse_value
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = [sys.executable, "-m", "sb3_roles"]
+# OR-Tools is an extra, and the oracle plans for seconds: see test_vrpc.py.
+SLOW = ("vrpc", "oracle")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "envs"), str(ROOT)])}
 
 
@@ -75,6 +77,10 @@ WRONG = [
         "sb3-roles simulate: error",
         "not both",
     ),
+    (["simulate", "--controller", "random,"], "sb3-roles simulate: error", "controller ''"),
+    (["simulate", "--stream", "training"], "sb3-roles simulate: error", "held_out, raw"),
+    (["simulate", "--out", "x.csv"], "sb3-roles simulate: error", ".parquet"),
+    (["simulate", "--out", "/nowhere/x.parquet"], "sb3-roles simulate: error", "'/nowhere'"),
     (["simulate", "--render", "x.bmp"], "sb3-roles simulate: error", ".png"),
     (["simulate", "--render", "/nowhere/x.png"], "sb3-roles simulate: error", "'/nowhere'"),
     (["bench"], "sb3-roles bench: error", "benchmark"),
@@ -110,7 +116,7 @@ def test_nothing_heavy_is_imported_before_the_arguments_are_right():
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("controller", CONTROLLER_NAMES)
+@pytest.mark.parametrize("controller", [n for n in CONTROLLER_NAMES if n not in SLOW])
 def test_simulate_json(controller):
     report = simulate_json(
         *("--controller", controller, "--scene", "easy", "--n-agents", "3", "--episodes", "30"),
@@ -119,20 +125,29 @@ def test_simulate_json(controller):
     config = report["config"]
     assert config["controller"] == controller
     assert (config["episodes"], config["seed"], config["first_episode"]) == (30, 5, 0)
+    assert config["stream"] == {"kind": "held_out", "seed": 2**32 + 5}
     assert config["version"]
+    assert len(config["config_hash"]) == 64
     scene = config["scene"]
     assert (scene["name"], scene["n_agents"], scene["horizon"]) == ("easy", 3, 20)
     assert scene["free_fraction"] == 0.7
     metrics = report["metrics"]
     for name in ("explo_paper", "explo_true", "cover"):
+        low, high = metrics[name]["ci95"]
         assert metrics[name]["unit"] == "%"
-        assert 0 < metrics[name]["mean"] < 100
+        assert 0 < low < metrics[name]["mean"] < high < 100
         assert 0 < metrics[name]["se"] < 10
-    assert set(metrics["time_e_paper"]) == {"mean", "se", "unit"}
-    assert set(metrics["t90_true"]) == {"mean", "se", "unit", "share"}
-    assert metrics["length"] == {"mean": 20.0, "se": 0.0, "unit": "steps"}
+    assert set(metrics["time_e_paper"]) == {"mean", "se", "ci95", "unit"}
+    assert set(metrics["t90_true"]) == {"mean", "se", "ci95", "unit", "share"}
+    steps = {"mean": 20.0, "se": 0.0, "ci95": [20.0, 20.0], "unit": "steps"}
+    assert metrics["length"] == steps
+    assert 0 < metrics["path_length"]["mean"] <= 20
     assert report["joint_steps"] == 600
-    assert report["episodes_per_second"] > 0
+    timing = report["timing"]
+    assert timing["batch_size"] == 256
+    assert 0 < timing["decision"]["median"] <= timing["decision"]["p95"]
+    assert timing["decision"]["mean"] * 600 < timing["seconds"]
+    assert timing["episodes_per_second"] > 0
 
 
 def test_batch_size_changes_no_metric():
@@ -149,7 +164,133 @@ def test_simulate_table_and_frame(tmp_path):
     assert result.stderr == ""
     assert "explo_paper" in result.stdout
     assert "±" in result.stdout
+    assert "95 % confidence interval" in result.stdout
+    assert "held-out seed 0" in result.stdout
+    assert "decision time" in result.stdout
     assert frame.read_bytes().startswith(b"\x89PNG")
+
+
+SMALL = ("--scene-options", "height:7", "width:7", "n_targets:8", "horizon:6")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A run folder as ``train.py`` leaves it, with a comma in its name."""
+    from sb3_roles.common.checkpoint import CheckpointFolder
+    from sb3_roles.zoo.config import resolve, write_yaml
+    from sb3_roles.zoo.models import make_env, make_model
+    from sb3_roles.zoo.run_folder import CHECKPOINTS
+
+    run = tmp_path_factory.mktemp("a,b")
+    scene = {"height": 7, "width": 7, "n_targets": 8, "horizon": 6}
+    settings = {"n_timesteps": 8, "n_envs": 2, "n_steps": 2, "batch_size": 2, "env_kwargs": scene}
+    config = resolve("mappo", "area-search-v0", settings, 0)
+    model = make_model(config, make_env(config), "cpu")
+    write_yaml(run / "config.yml", config)
+    CheckpointFolder(run / CHECKPOINTS).prepare()
+    CheckpointFolder(run / CHECKPOINTS).save(0, manifest={}, policy=model.policy.state_dict())
+    return run
+
+
+@pytest.fixture
+def printed(capsys):
+    """Run a command in this process; what it prints."""
+    from sb3_roles.zoo.cli import main
+
+    def run(*args: str) -> str:
+        assert main(args) == 0
+        captured = capsys.readouterr()
+        assert captured.err == ""
+        return captured.out
+
+    return run
+
+
+def test_evaluate_compares_on_the_same_episodes(trained, tmp_path, printed):
+    from sb3_roles.evaluation.metrics import paired_differences, summarize
+    from sb3_roles.evaluation.records import read_records
+
+    controllers = ("--controller", "random", "--controller", str(trained))
+    common = ("evaluate", *controllers, "--episodes", "20", "--seed", "4", *SMALL)
+    out = tmp_path / "x.parquet"
+    report = json.loads(printed(*common, "--json", "--stochastic", "--out", str(out)))
+    first, second = report["controllers"]
+    (difference,) = report["differences"]
+    assert first["config"]["stream"] == second["config"]["stream"]
+    assert (first["config"]["controller"], first["config"]["deterministic"]) == ("random", None)
+    assert second["config"]["controller"] == difference["controller"] == str(trained)
+    assert second["config"]["deterministic"] is False
+    assert second["config"]["communication"] is True
+    assert difference["against"] == "random"
+
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == 2
+    assert files[0].name == "x-random.parquet" or files[1].name == "x-random.parquet"
+    random = read_records(tmp_path / "x-random.parquet")
+    (learned,) = (read_records(file) for file in files if file.name != "x-random.parquet")
+    assert json.loads(json.dumps(summarize(learned))) == second["metrics"]
+    assert difference["metrics"] == json.loads(json.dumps(paired_differences(learned, random)))
+    assert difference["metrics"]["cover"]["mean"] == pytest.approx(
+        second["metrics"]["cover"]["mean"] - first["metrics"]["cover"]["mean"]
+    )
+
+    table = printed(*common, "--no-communication")
+    assert "differences to random on the same episodes" in table
+    assert sum(line.startswith(str(trained)) for line in table.splitlines()) == 3
+
+
+def test_evaluate_plays_what_run_episodes_plays(printed):
+    from area_search import get_scene
+    from sb3_roles.baselines.random import RandomController
+    from sb3_roles.evaluation.episodes import held_out_seed, run_episodes
+    from sb3_roles.evaluation.metrics import summarize
+
+    args = ("evaluate", "--controller", "random", "--episodes", "9", "--seed", "2", "--json")
+    for stream, seed in (("held_out", held_out_seed(2)), ("raw", 2)):
+        report = json.loads(printed(*args, "--stream", stream, "--first-episode", "3"))
+        records = run_episodes(RandomController(), get_scene("hard"), 9, seed, first_episode=3)
+        assert report["metrics"] == summarize(records)
+        assert report["config"]["seed"] == 2
+        assert report["config"]["stream"] == {"kind": stream, "seed": seed}
+
+
+def test_records_prints_what_simulate_printed(tmp_path, printed):
+    out = tmp_path / "x.parquet"
+    args = ("simulate", "--episodes", "5", "--seed", "3", "--out", str(out))
+    simulated = json.loads(printed(*args, "--json"))
+    assert json.loads(printed("records", str(out), "--json")) == simulated
+    table = printed("records", str(out))
+    assert "random on hard: 4 robots, 5 episodes, held-out seed 3" in table
+    assert simulated["config"]["config_hash"][:16] in table
+
+
+def test_wrong_evaluations(trained, tmp_path, capsys):
+    from sb3_roles.zoo.cli import main
+
+    broken = tmp_path / "broken.parquet"
+    broken.write_bytes(b"PAR1")
+    run = str(trained)
+    for args, part in [
+        (["evaluate"], "--controller"),
+        (["evaluate", "--controller", "randm"], "did you mean 'random'"),
+        (["evaluate", "--controller", "random,random"], "'random' is given twice"),
+        (["evaluate", "--controller", "random", "--controller", "random"], "given twice"),
+        (["evaluate", "--controller", "random,"], "unknown controller or run folder ''"),
+        (["evaluate", "--controller", f"random,{tmp_path}"], "config.yml"),
+        (["evaluate", "--controller", run, "--deterministic", "--stochastic"], "not allowed"),
+        (["evaluate", "--controller", run, "--load-best"], "best"),
+        (["records", str(broken)], "no Parquet file"),
+        (["records", str(tmp_path / "none.parquet")], "No such file"),
+        (["records"], "FILE"),
+    ]:
+        with pytest.raises(SystemExit) as end:
+            main(args)
+        assert end.value.code == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith(f"sb3-roles {args[0]}: error: ")
+        assert part in captured.err, captured.err
+        assert captured.err.count("\n") == 1
 
 
 def test_closed_pipe_ends_quietly():
@@ -204,6 +345,8 @@ def test_interrupt_ends_quietly():
         ("1e6", 1e6),
         ("true", True),
         ("None", None),
+        ("none", "none"),
+        ("True", True),
         ("null", None),
         ("same_role", "same_role"),
         ("no", "no"),

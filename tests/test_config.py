@@ -5,23 +5,39 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
+import toy_envs
 import yaml
 
 from area_search.paths import SUB_GOALS
 from area_search.rewards import REWARD_COMPONENTS
-from sb3_roles.common.role_wrapper import REWARD_SHARING
+from area_search.scenes import SCENES, Scene, get_scene
+from sb3_roles.common.checkpoint import Checkpoint, CheckpointError
+from sb3_roles.common.role_wrapper import REWARD_SHARING, RoleWrapper
 from sb3_roles.common.team_vec_env import BACKENDS
 from sb3_roles.common.torch_layers import ENCODERS, NORM_LAYERS, PRECISIONS
 from sb3_roles.hmappo.policies import PRIMITIVE_INPUTS
-from sb3_roles.zoo import config as zoo_config
-from sb3_roles.zoo import environments
+from sb3_roles.zoo import config_checks, environments
 from sb3_roles.zoo.algorithms import ALGORITHMS, NOT_CONFIGURED, POLICY_ARGUMENTS, get_algorithm
-from sb3_roles.zoo.config import ConfigError, load_settings, merge, resolve
-from sb3_roles.zoo.environments import env_factory
-from sb3_roles.zoo.models import complete, constructor_parameters
+from sb3_roles.zoo.config import (
+    ConfigError,
+    load_identity,
+    load_settings,
+    merge,
+    resolve,
+    write_yaml,
+)
+from sb3_roles.zoo.environments import check_named, env_factory
+from sb3_roles.zoo.models import (
+    complete,
+    constructor_parameters,
+    make_env,
+    make_model,
+    steps_of,
+)
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ranges import Number, Whole, yaml_number
 
@@ -54,8 +70,8 @@ def test_tables_are_the_signatures(algorithm):
 def test_names_are_those_of_the_code():
     assert SUB_GOALS == environments.SUB_GOALS
     assert REWARD_COMPONENTS == environments.REWARD_COMPONENTS
-    assert REWARD_SHARING == zoo_config.REWARD_SHARING
-    assert BACKENDS == zoo_config.VEC_ENVS
+    assert REWARD_SHARING == config_checks.REWARD_SHARING
+    assert BACKENDS == config_checks.VEC_ENVS
     assert POLICY_ARGUMENTS["RolePolicy"]["norm_layer"].names == NORM_LAYERS
     assert POLICY_ARGUMENTS["RolePolicy"]["encoder"].names == ENCODERS
     assert POLICY_ARGUMENTS["RolePolicy"]["precision"].names == PRECISIONS
@@ -67,7 +83,7 @@ def test_names_are_those_of_the_code():
 def test_every_algorithm_has_a_configuration(algo, env):
     config = resolve(algo, env, load_settings(algo, env))
     whole = complete(config)
-    assert zoo_config.config_problems(whole) == []
+    assert config_checks.config_problems(whole) == []
     assert set(whole) >= set(ALGORITHMS[algo].parameters) - {"target_kl", "clip_range_vf"}
 
 
@@ -76,11 +92,52 @@ def test_files(file):
     algo = file.stem.partition("_paper")[0]
     for env in yaml.safe_load(file.read_text()):
         resolve(algo, ENV if env == ENV else "some:factory", load_settings(algo, env, file))
-    tags = ("Paper", "Released code", "Ours")
-    for line in file.read_text().splitlines():
-        # The rows of a matrix share the tag of its name.
-        if re.match(r"\s+\w+: *([^\s{]|\{\})", line):
-            assert re.search(rf"# ({'|'.join(tags)})\b", line), line
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
+def test_every_key_has_a_tag_and_a_comment(file):
+    text = file.read_text()
+    lines = text.splitlines()
+    found = list(keys_of(yaml.compose(text)))
+    assert len(found) > 20
+    for key in found:
+        line = lines[key.start_mark.line]
+        assert re.search(r" # (Paper|Released code|Ours): \S", line), f"{key.value}: {line}"
+
+
+def keys_of(node):
+    """All keys of a YAML document, at any depth."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield key
+            yield from keys_of(value)
+    elif isinstance(node, yaml.SequenceNode):
+        for value in node.value:
+            yield from keys_of(value)
+
+
+def test_keys_are_found_at_any_depth():
+    text = "a:\n  b: {c: 1, d: [{e: 2}]}\n  f: null\n"
+    assert [key.value for key in keys_of(yaml.compose(text))] == ["a", "b", "c", "d", "e", "f"]
+
+
+def test_the_paper_names_every_value():
+    """No default of ours is behind the paper's results."""
+    settings = load_settings("hmappo", ENV, FILES_BY_NAME["hmappo_paper"])
+    whole = complete(resolve("hmappo", ENV, {"n_timesteps": 1}))
+    # The radius of the graph is the environment's.
+    filled = {"communication_radius"}
+    assert set(whole) - set(settings) == {"algo", "env", "seed", "vec_env"}
+    named = set(settings["policy_kwargs"])
+    assert named >= set(POLICY_ARGUMENTS["RolePolicy"]) - filled
+    assert set(settings["wrapper_kwargs"]) == set(constructor_parameters(RoleWrapper)) - {"venv"}
+    scene = {field.name for field in fields(Scene)}
+    # What the scenes differ in, so that --scene still means what it says; the wrapper's rewards.
+    others = {"name", "n_targets", "free_fraction", "alpha", "beta", "reward_sharing"}
+    assert set(settings["env_kwargs"]) == scene - others | {"scene", "sub_goal"}
+    for name in SCENES:
+        changed = get_scene(name, **{key: settings["env_kwargs"][key] for key in scene - others})
+        assert changed == get_scene(name, early_stop_patience=10)
 
 
 def test_the_paper_to_the_letter():
@@ -133,12 +190,31 @@ FILES_BY_NAME = {path.stem: path for path in FILES}
             "primitive_weights.cover: unknown reward component 'x'",
         ),
         ({"n_steps": 10, "batch_size": 1000}, "batch_size must be at most n_steps x n_envs"),
+        ({"policy": ["RolePolicy"]}, "policy is unknown value"),
+        ({"wrapper_kwargs": {"roles": [1], "role_control": "explore"}}, "roles entry|role_control"),
+        ({"vec_env": "native"}, "vec_env is no hyperparameter: give --vec-env"),
+        (
+            {"policy_kwargs": {"communication_radius": 5}},
+            "policy_kwargs.communication_radius must be the environment's, 10, got 5",
+        ),
+        (
+            {"policy_kwargs": {"communication_radius": None}},
+            "communication_radius must be the environment's, 10, got None",
+        ),
+        ({"env_kwargs": {"reward_sharing": "same_role"}}, "wrapper_kwargs.reward_sharing shares"),
+        ({"env_kwargs": {"alpha": 0.3}}, "env_kwargs.alpha weighs nothing.*role_weights"),
     ],
 )
 def test_problems(settings, expected):
     found = lines(**settings)
-    assert len(found) == 1
+    if "roles" not in settings.get("wrapper_kwargs", {}):
+        assert len(found) == 1
     assert re.search(expected, found[0]), found[0]
+
+
+def test_a_file_does_not_choose_the_environment():
+    with pytest.raises(ConfigError, match="env is no hyperparameter: give --env"):
+        resolve("hmappo", ENV, {**GOOD, "env": "subprocess:Popen"})
 
 
 def test_all_problems_at_once():
@@ -153,6 +229,72 @@ def test_rules_of_single_algorithms():
     assert "did you mean 'area-search-v0'" in lines(env="area-serch-v0")[0]
     with pytest.raises(ValueError, match="did you mean 'ppo'"):
         get_algorithm("pp0")
+
+
+def test_the_environment_gives_the_radius_of_the_graph():
+    for algo, env_kwargs, expected in [
+        ("hmappo", {}, 10.0),
+        ("mappo", {"communication_radius": 3}, 3.0),
+        ("ppo", {"communication_radius": 0.5}, 0.5),
+    ]:
+        config = resolve(algo, ENV, {**GOOD, "env_kwargs": env_kwargs})
+        assert config["policy_kwargs"] == {"communication_radius": expected}
+        # What was written is read again.
+        assert resolve(algo, ENV, {key: config[key] for key in GOOD | {"env_kwargs": 0,
+                       "policy_kwargs": 0}}) == config  # fmt: skip
+        model = make_model({**config, "n_envs": 1}, make_env(config, 1), "cpu")
+        assert model.policy.communication_radius == expected
+    # These have no graph, and others' environments no radius.
+    assert resolve("maskable_ppo", ENV, GOOD)["policy_kwargs"] == {}
+    assert resolve("hmappo", "some:factory", GOOD)["policy_kwargs"] == {}
+
+
+def test_rewards_are_shared_once():
+    """Without roles the environment shares, with roles the wrapper does."""
+    settings = {**GOOD, "env_kwargs": {"reward_sharing": "same_role", "alpha": 0.3, "beta": 0.7}}
+    assert resolve("mappo", ENV, settings)["env_kwargs"]["alpha"] == 0.3
+    assert len(lines("ppo", env_kwargs=settings["env_kwargs"])) == 3
+
+
+def test_seeds_are_no_aliases():
+    biggest = 2**32 - 1
+    assert resolve("mappo", ENV, GOOD, seed=biggest)["seed"] == biggest
+    with pytest.raises(ConfigError, match=r"seed must be .* \[0, 4294967295\], got 4294967296"):
+        resolve("mappo", ENV, GOOD, seed=biggest + 1)
+
+
+def test_identity_of_a_run(tmp_path):
+    file = tmp_path / "config.yml"
+    config = resolve("mappo", "some:factory", GOOD, 7, "supersuit")
+    write_yaml(file, config)
+    identity = {"algo": "mappo", "env": "some:factory", "seed": 7, "vec_env": "supersuit"}
+    assert load_identity(file) == identity
+    assert load_settings("mappo", "some:factory", file).keys() == config.keys() - identity.keys()
+    assert load_identity(FILES_BY_NAME["hmappo_paper"]) == {}
+    for key, wrong in [("algo", "mapo"), ("algo", ["mappo"]), ("env", 3), ("seed", "x"),
+                       ("seed", -1), ("vec_env", {})]:  # fmt: skip
+        write_yaml(file, {**config, key: wrong})
+        with pytest.raises(ConfigError, match=rf"config.yml: {key} "):
+            load_identity(file)
+
+
+def test_a_manifest_may_say_anything():
+    for said, steps in [({}, 0), ({"env_steps": 3}, 3)]:
+        assert steps_of(Checkpoint(said, {}, {}, {}), "env_steps") == steps
+    for wrong in ("3", -1, 2.5, [1], None):
+        with pytest.raises(CheckpointError, match="damaged checkpoint: env_steps is"):
+            steps_of(Checkpoint({"env_steps": wrong}, {}, {}, {}), "env_steps")
+
+
+def test_code_is_named_by_the_user():
+    check_named("run", ENV, None)
+    check_named("run", ENV, ENV)
+    check_named("run", "a:b", "a:b")
+    with pytest.raises(UsageError, match=r"run: its environment is code.*add --env a:b"):
+        check_named("run", "a:b", None)
+    for named in ("a:c", ENV):
+        with pytest.raises(UsageError, match="its environment is a:b, not"):
+            check_named("run", "a:b", named)
 
 
 def test_numbers():
@@ -191,6 +333,7 @@ def test_merge():
         ("- 1", "must be keys and values"),
         ("other-env: {}", "unknown environment 'area-search-v0'"),
         ("default: 3", "must be keys and values"),
+        ("1: {}", "unknown environment 'area-search-v0'"),
         ("default: !!python/object/apply:os.system [echo]", "not valid YAML"),
         ("a: \xff", "not valid YAML"),
     ],
@@ -216,6 +359,15 @@ def test_bad_files(tmp_path, text, expected):
 def test_bad_factories(env, expected):
     with pytest.raises(UsageError, match=expected):
         env_factory(env, {"x": 1})
+
+
+def test_the_environment_that_is_tried_is_closed(monkeypatch):
+    closed = []
+    monkeypatch.setattr(toy_envs.PlainEnv, "close", lambda self: closed.append(self))
+    make = env_factory("toy_envs:PlainEnv", {"horizon": 3})
+    assert len(closed) == 1
+    assert make().horizon == 3
+    assert len(closed) == 1
 
 
 def test_no_torch_before_the_configuration_is_checked():

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {
@@ -32,7 +34,7 @@ def logs(tmp_path_factory) -> Path:
     from sb3_roles.common.checkpoint import CheckpointFolder
     from sb3_roles.zoo.config import resolve, write_yaml
     from sb3_roles.zoo.models import make_env, make_model
-    from sb3_roles.zoo.run_folder import BEST, BEST_FILE, CHECKPOINTS, new_run
+    from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS, new_run
 
     root = tmp_path_factory.mktemp("logs")
     scene = {"height": 7, "width": 7, "n_targets": 8, "horizon": 6, "sub_goal": "assigned"}
@@ -53,10 +55,9 @@ def logs(tmp_path_factory) -> Path:
         CheckpointFolder(run / CHECKPOINTS).prepare()
         CheckpointFolder(run / CHECKPOINTS).save(0, manifest={}, policy=weights)
         if seed == 0:
-            from sb3_roles.common.checkpoint import write_checkpoint
+            from sb3_roles.evaluation.callback import save_policy
 
-            (run / BEST).mkdir()
-            write_checkpoint(run / BEST / BEST_FILE, {}, weights)
+            save_policy(model, run / BEST, {})
     return root
 
 
@@ -97,6 +98,10 @@ def test_the_launcher_films_an_episode(logs, tmp_path):
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     assert n_frames(tmp_path / "episode.gif") == 7
+    result = command("enjoy.py", "--sed", "1")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("enjoy.py: error: ")
+    assert "did you mean '--seed'?" in result.stderr
 
 
 @pytest.mark.parametrize("ending", [".gif", ".mp4"])
@@ -132,6 +137,44 @@ def test_another_environment_is_played(logs, play):
     )
     assert "return" in printed
     assert "length 5" in printed
+
+
+def test_code_runs_only_if_the_user_names_it(logs, tmp_path, play, monkeypatch, capsys):
+    """A run folder from anybody must not choose what is imported and called."""
+    from sb3_roles.zoo import environments
+    from sb3_roles.zoo.cli import main
+    from sb3_roles.zoo.models import load_model
+    from sb3_roles.zoo.options import UsageError
+
+    run = tmp_path / "run"
+    shutil.copytree(logs / "mappo" / "toy_envs-PlainEnv_1", run)
+    config = yaml.safe_load((run / "config.yml").read_text())
+    evil = "subprocess:Popen"
+    (run / "config.yml").write_text(
+        yaml.safe_dump({**config, "env": evil, "env_kwargs": {"args": ["touch", "x"]}})
+    )
+    imported = []
+    monkeypatch.setattr(environments, "import_module", imported.append)
+    wrong = [
+        (["-f", str(run)], f"add --env {evil} if you trust it"),
+        (["-f", str(run), "--env", "toy_envs:PlainEnv"], f"is {evil}, not toy_envs:PlainEnv"),
+        (["-f", str(run), "--env", "area-search-v0"], f"is {evil}, not area-search-v0"),
+    ]
+    for args, message in wrong:
+        with pytest.raises(SystemExit) as end:
+            main(["enjoy", "--no-render", *args])
+        error = capsys.readouterr().err
+        assert end.value.code == 2
+        assert message in error
+        assert error.count("\n") == 1
+    with pytest.raises(UsageError, match="its environment is code"):
+        load_model(run)
+    with pytest.raises(UsageError, match="not area-search-v0"):
+        load_model(run, env="area-search-v0")
+    assert imported == []
+    monkeypatch.undo()
+    model = load_model(logs / "mappo" / "toy_envs-PlainEnv_1", env="toy_envs:PlainEnv")
+    assert model.num_timesteps == 0
 
 
 def test_a_window_shows_the_episode(logs, play, monkeypatch):
@@ -200,6 +243,9 @@ WRONG = [
     (["enjoy", "-f", "LOGS", "--env-kwargs", "horizn:4"], "horizon"),
     (["enjoy", "-f", "LOGS", "--load-best"], "area-search-v0_2"),
     (["enjoy", "-f", "LOGS", "--deterministic", "--stochastic"], "not allowed"),
+    (["enjoy", "-f", "LOGS/hmappo/area-search-v0_1", "--algo", "mappo"], "hmappo, not mappo"),
+    (["enjoy", "-f", "LOGS/mappo/toy_envs-PlainEnv_1"], "add --env toy_envs:PlainEnv"),
+    (["enjoy", "-f", "LOGS", "--device", "gpu"], "allowed are auto, cpu, cuda"),
     (["enjoy", "-f", "LOGS", "--fps", "0"], "--fps"),
     (["evaluate", "--controller", "randm"], "did you mean 'random'"),
     (["evaluate", "--controller", "LOGS"], "config.yml"),
@@ -212,7 +258,7 @@ def test_wrong_command_line(args, part, logs, capsys):
     from sb3_roles.zoo.cli import main
 
     with pytest.raises(SystemExit) as end:
-        main([str(logs) if arg == "LOGS" else arg for arg in args])
+        main([arg.replace("LOGS", str(logs)) for arg in args])
     assert end.value.code == 2
     message = capsys.readouterr().err
     assert message.startswith(f"sb3-roles {args[0]}: error: ")

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.mappo import MAPPO
+from sb3_roles.zoo import job
+from sb3_roles.zoo.cli import main
+from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.models import make_env
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.run_folder import RunLock
-from sb3_roles.zoo.train import main
+from sb3_roles.zoo.run_folder import RunLock, source_commit
 
 ROOT = Path(__file__).resolve().parents[1]
 PATHS = [str(ROOT / "envs"), str(ROOT), str(ROOT / "tests")]
@@ -26,14 +31,16 @@ SMALL = ["-params", "n_envs:4", "n_steps:8", "batch_size:16", "n_epochs:1"]
 FAST = ["--num-threads", "1", "--eval-freq", "0", "--eval-episodes", "4", "--device", "cpu"]
 
 
-def start(*args: object) -> subprocess.Popen[str]:
+def start(*args: object, **options: Any) -> subprocess.Popen[str]:
     command = [sys.executable, str(ROOT / "train.py"), *map(str, args)]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, env=ENVIRONMENT, stdout=pipe, stderr=pipe, text=True)
+    return subprocess.Popen(
+        command, env=ENVIRONMENT, stdout=pipe, stderr=pipe, text=True, **options
+    )
 
 
-def train(*args: object) -> subprocess.CompletedProcess[str]:
-    process = start(*args)
+def train(*args: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    process = start(*args, **options)
     out, err = process.communicate(timeout=120)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
@@ -58,18 +65,48 @@ WRONG = [
     (["--num-threads", "0"], "from 1 to 1024"),
     (["--resume", "/no/such/run"], "no such run folder"),
     (["--resume", "x", "--seed", "3"], "leave --seed out"),
+    (["--seed", str(2**32)], "from 0 to 4294967295"),
+    (["--seed", str(2**32 - 1), "--n-seeds", "2"], "seed must be"),
+    (["-n", "5", "-params", "env:subprocess:Popen"], "env is no hyperparameter: give --env"),
+    (["-n5x"], "joint steps, got '5x'"),
+    (["-xn5"], "unknown option '-xn5'"),
+    (["extra"], "unexpected argument 'extra'"),
+    (["--n-agents", "2", "-f", "/proc/none/logs"], "/proc/none"),
+    (["-tb", "/dev/null"], "/dev/null: File exists"),
+    (["-params", "policy_kwargs:{optimizer_kwargs: null}"], "keys and values, got None"),
+    (["--env-kwargs", "sub_goal:none", "-params", "gama:1"], "did you mean 'gamma'?"),
+    (["-conf", str(ROOT / "zoo_configs")], "zoo_configs: Is a directory"),
+    (
+        [
+            "--env-kwargs",
+            "communication_radius:5",
+            "-params",
+            "policy_kwargs:{communication_radius: 4}",
+        ],
+        "must be the environment's, 5, got 4",
+    ),
+    (["--env-kwargs", "reward_sharing:same_role"], "wrapper_kwargs.reward_sharing"),
 ]
 
 
-@pytest.mark.parametrize(("args", "expected"), WRONG, ids=lambda value: " ".join(value)[:40])
-def test_wrong_arguments(tmp_path, args, expected):
-    where = [] if "--resume" in args else ["-f", tmp_path]
-    result = train(*args, *where)
-    assert result.returncode == 2, result.stderr
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1, result.stderr
-    assert result.stderr.startswith("train.py: error: ")
-    assert expected in result.stderr
+def run_main(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
+    """``train.py`` in this process: its exit code, and what it prints."""
+    try:
+        code = main(args, "train")
+    except SystemExit as end:
+        code = end.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.mark.parametrize(("args", "expected"), WRONG)
+def test_wrong_arguments(tmp_path, capsys, args, expected):
+    where = [] if {"--resume", "-f"} & set(args) else ["-f", str(tmp_path)]
+    code, out, err = run_main(capsys, *args, *where)
+    assert (code, out) == (2, ""), err
+    assert err.count("\n") == 1, err
+    assert err.startswith("train.py: error: ")
+    assert expected in err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -102,8 +139,9 @@ def test_help():
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
-    options = ["--seed", 5, "--n-seeds", 2, "-n", 320, "--save-freq", 160, "-f", folder]
-    result = train("--algo", "mappo", *TINY, *SMALL, *FAST, *options)
+    # The first option has its value attached.
+    options = ["--seed", 5, "--n-seeds", 2, "--save-freq", 160, "-f", folder]
+    result = train("-n320", "--algo", "mappo", *TINY, *SMALL, *FAST, *options)
     assert result.returncode == 0, result.stderr
     return folder, result.stdout
 
@@ -120,7 +158,7 @@ def test_run_folder(logs):
     assert config["env_kwargs"]["height"] == 7
     assert config["kl_target"] == 0.01
     command = (run / "command.txt").read_text()
-    assert command.startswith("train.py --algo mappo")
+    assert command.startswith("train.py -n320 --algo mappo")
     assert "torch" in command
     assert len((run / "progress.csv").read_text().splitlines()) == 11
     names = [path.name for path in (run / "checkpoints").iterdir()]
@@ -134,7 +172,8 @@ def test_run_folder(logs):
 def test_config_of_a_run_repeats_it(logs, tmp_path):
     folder, _ = logs
     run = folder / "mappo" / "area-search-v0_1"
-    result = train("--algo", "mappo", "-conf", run / "config.yml", "--seed", 5, "-f", tmp_path,
+    # Algorithm, environment and seed are the run's; the backend is given.
+    result = train("-conf", run / "config.yml", "-f", tmp_path,
                    "--tensorboard-log", tmp_path / "tb", "--vec-env", "supersuit",
                    *FAST)  # fmt: skip
     assert result.returncode == 0, result.stderr
@@ -143,6 +182,156 @@ def test_config_of_a_run_repeats_it(logs, tmp_path):
     for name, tensor in first.policy.items():
         assert tensor.equal(second.policy[name])
     assert list((tmp_path / "tb").rglob("events*"))
+    config = yaml.safe_load((again / "config.yml").read_text())
+    assert (config["seed"], config["vec_env"]) == (5, "supersuit")
+    assert yaml.safe_load((again / "args.yml").read_text())["algo"] == "mappo"
+
+
+def test_the_command_line_wins_over_the_config_of_a_run(logs, tmp_path, monkeypatch, capsys):
+    file = str(logs[0] / "mappo" / "area-search-v0_1" / "config.yml")
+    seen = []
+    monkeypatch.setattr(job, "run_job", lambda job: seen.append(job["config"]) or 0)
+    assert main(["-conf", file, "--seed", "9", "--n-seeds", "2", "-n5"], "train") == 0
+    assert main(["-conf", file, "--env", "toy_envs:PlainEnv", "-params",
+                 "env_kwargs:null"], "train") == 0  # fmt: skip
+    assert [config["seed"] for config in seen] == [9, 10, 5]
+    assert [config["n_timesteps"] for config in seen] == [5, 5, 320]
+    assert [config["env"] for config in seen] == [*2 * ["area-search-v0"], "toy_envs:PlainEnv"]
+    code, _, err = run_main(capsys, "-conf", file, "--algo", "hmappo")
+    assert code == 2
+    assert "is of a run of mappo: leave --algo hmappo out" in err
+    assert len(seen) == 3
+
+
+def test_a_file_imports_nothing_that_the_user_did_not_name(tmp_path, capsys):
+    file = tmp_path / "config.yml"
+    config = {"algo": "mappo", "env": "subprocess:Popen", "env_kwargs": {"args": "id"}}
+    write_yaml(file, {**config, "n_timesteps": 10})
+    write_yaml(tmp_path / "args.yml", {})
+    write_yaml(tmp_path / "bad.yml", {"default": {"env": config["env"], "n_timesteps": 10}})
+    named = "add --env subprocess:Popen if you trust it"
+    other = ["--env", "area-search-v0"]
+    for args, expected in [
+        (["-conf", str(file)], named),
+        (["--resume", str(tmp_path)], named),
+        (["--resume", str(tmp_path), *other], "is subprocess:Popen, not area-search-v0"),
+        (["-conf", str(tmp_path / "bad.yml")], "env is no hyperparameter: give --env"),
+    ]:
+        code, _, err = run_main(capsys, *args)
+        assert code == 2
+        assert expected in err
+        assert err.count("\n") == 1
+
+
+def test_a_resume_that_fails_leaves_the_run_alone(logs, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(logs[0] / "mappo" / "area-search-v0_1", run)
+    files = ("config.yml", "command.txt", "progress.csv")
+    config = yaml.safe_load((run / "config.yml").read_text())
+    write_yaml(run / "config.yml", {**config, "policy_kwargs": {"graph_width": 9}})
+    before = [(run / name).read_bytes() for name in files]
+    wrong = [
+        (["-n", "640"], "do not fit the configuration"),
+        (["-n", "100"], "has 320 joint steps already, more than -n 100"),
+    ]
+    for args, message in wrong:
+        code, _, err = run_main(capsys, "--resume", str(run), *args)
+        assert code == 2
+        assert message in err
+        assert err.count("\n") == 1
+        assert [(run / name).read_bytes() for name in files] == before
+    write_yaml(run / "config.yml", config)
+    (run / "progress.csv").write_bytes(b"\xff\xfe")
+    code, _, err = run_main(capsys, "--resume", str(run), "-n", "640")
+    assert code == 2
+    assert "progress.csv: damaged log" in err
+    assert yaml.safe_load((run / "config.yml").read_text()) == config
+    write_yaml(run / "args.yml", {"tensorboard_log": 3})
+    code, _, err = run_main(capsys, "--resume", str(run))
+    assert code == 2
+    assert "tensorboard_log must be a text, got 3" in err
+
+
+@pytest.mark.parametrize("window", [3, 100])
+def test_the_window_is_that_of_the_configuration(tmp_path, monkeypatch, window):
+    made = []
+    for name in ("TeamMetricsCallback", "RoleCallback"):
+        kind = getattr(job, name)
+        monkeypatch.setattr(
+            job, name, lambda *args, kind=kind, **options: made.append(kind(*args, **options))
+            or made[-1]
+        )  # fmt: skip
+    args = ["-n", "64", "-f", str(tmp_path), *TINY, *SMALL, f"stats_window_size:{window}", *FAST]
+    assert main([*args, "--verbose", "0"], "train") == 0
+    assert [callback.window.maxlen for callback in made] == [window, window]
+    # 16 steps of four teams, episodes of 6: two each.
+    assert len(made[0].window) == min(window, 8)
+
+
+def test_environments_are_closed_in_the_end(tmp_path, monkeypatch):
+    made, closed = [], []
+
+    def make(*args):
+        env = make_env(*args)
+        close = env.close
+        env.close = lambda: (closed.append(env), close())
+        made.append(env)
+        return env
+
+    monkeypatch.setattr(job, "make_env", make)
+    args = ["--env", "toy_envs:PlainEnv", "--algo", "mappo", "-n", "32", "-f", str(tmp_path),
+            *SMALL, "--eval-freq", "16", "--eval-episodes", "2", "--verbose", "0"]  # fmt: skip
+    assert main(args, "train") == 0
+    # That of the training, of the periodic evaluation, and of the last one.
+    assert len(made) == 3
+    assert set(map(id, closed)) == set(map(id, made))
+
+    def diverge(self):
+        raise FloatingPointError("the loss is nan")
+
+    made.clear(), closed.clear()
+    monkeypatch.setattr(MAPPO, "train", diverge)
+    assert main(args, "train") == 3
+    assert len(made) == 2
+    assert set(map(id, closed)) == set(map(id, made))
+
+
+def test_the_commit_is_that_of_the_source(tmp_path):
+    def git(*args: str) -> str:
+        who = ["-c", "user.name=x", "-c", "user.email=x@x"]
+        command = ["git", "-C", str(tmp_path), *who, *args]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    file = tmp_path / "package" / "module.py"
+    file.parent.mkdir()
+    file.write_text("1")
+    assert source_commit(file) is None
+    git("init", "-q")
+    # In the tree of another project, as what is installed in its virtual environment.
+    git("commit", "-q", "--allow-empty", "-m", "x")
+    assert source_commit(file) is None
+    git("add", "package")
+    git("commit", "-q", "-m", "y")
+    assert source_commit(file) == git("rev-parse", "HEAD")
+    file.write_text("2")
+    assert source_commit(file) == git("rev-parse", "HEAD") + " with changes"
+
+
+def test_scripts_can_be_imported():
+    """As processes that are spawned do."""
+    code = "import runpy; [runpy.run_path(f + '.py', run_name='__mp_main__') for f in ({})]"
+    code = code.format("'train', 'enjoy'")
+    result = subprocess.run([sys.executable, "-c", code, "--nonsense"], env=ENVIRONMENT, cwd=ROOT,
+                            capture_output=True, text=True)  # fmt: skip
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+def test_a_closed_pipe_ends_quietly(tmp_path):
+    process = start("--algo", "mappo", *TINY, *SMALL, *FAST, "-n", 320, "-f", tmp_path)
+    process.stdout.close()
+    assert process.wait(timeout=100) == 141
+    assert process.stderr.read() == ""
+    process.stderr.close()
 
 
 def test_lock(tmp_path):
@@ -186,13 +375,24 @@ def test_signal_then_resume(logs, tmp_path, number, code):
         assert tensor.equal(second.policy[name])
 
 
+def test_too_little_memory_is_one_line(tmp_path, capsys):
+    """Torch raises a RuntimeError, after the rollout buffer is asked for 10^14 bytes."""
+    huge = ["-params", "n_envs:4", "n_steps:1000000", "batch_size:16"]
+    scene = ["--env-kwargs", "height:999", "width:999", "n_agents:2"]
+    code, _, err = run_main(capsys, "-f", str(tmp_path), *scene, *huge, *FAST, "--verbose", "0")
+    assert code == 2
+    assert err.startswith("train.py: error: out of memory: ")
+    assert err.count("\n") == 1
+
+
 @pytest.mark.parametrize("error", [FloatingPointError, ValueError])
 def test_numbers_that_are_not_finite(tmp_path, monkeypatch, capsys, error):
     def diverge(self):
         raise error("the loss is nan:\nno step was taken")
 
     monkeypatch.setattr(MAPPO, "train", diverge)
-    code = main(["--algo", "mappo", "-n", "32", "-f", str(tmp_path), *TINY, *SMALL, *FAST])
+    args = ["--algo", "mappo", "-n", "32", "-f", str(tmp_path), *TINY, *SMALL, *FAST]
+    code = main(args, "train")
     assert code == 3
     message = capsys.readouterr().err
     assert message.count("\n") == 1
@@ -207,6 +407,9 @@ def test_a_foreign_environment(tmp_path):
     run = tmp_path / "hmappo" / "toy_envs-PlainEnv_1"
     assert (run / "evaluation.yml").exists()
     result = train("--resume", run, "-n", 96)
+    assert result.returncode == 2
+    assert "add --env toy_envs:PlainEnv if you trust it" in result.stderr
+    result = train("--resume", run, "-n", 96, "--env", "toy_envs:PlainEnv")
     assert result.returncode == 0, result.stderr
     assert "not bit-exact: environment of this run offers no get_state" in result.stdout
     assert yaml.safe_load((run / "config.yml").read_text())["n_timesteps"] == 96

@@ -36,14 +36,16 @@ _STATE_ARRAYS = (
 )
 
 
-def observation_space(scene: Scene, sub_goal: str = "none") -> spaces.Dict:
+def observation_space(scene: Scene, sub_goal: str = "none", known_map: bool = False) -> spaces.Dict:
     """Return one robot's observation space; no shape depends on the number of robots.
 
     :param scene: the task
     :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param known_map: with the key ``known``
     :return: flat Dict of ``local`` uint8 (4, side, side), ``joint`` uint8 (2, height, width),
-        ``position`` float32 (2,), ``state`` uint8 (5, height, width) and, unless ``sub_goal`` is
-        ``"none"``, ``sub_goal`` float32 (2, 6) or (2, 11)
+        ``position`` float32 (2,), ``state`` uint8 (5, height, width); unless ``sub_goal`` is
+        ``"none"``, ``sub_goal`` float32 (2, 6) or (2, 11); with ``known_map``, ``known`` uint8
+        (2, height, width)
     :raises ValueError: if ``sub_goal`` is unknown
     """
     if sub_goal not in paths.SUB_GOALS:
@@ -61,6 +63,8 @@ def observation_space(scene: Scene, sub_goal: str = "none") -> spaces.Dict:
         high = np.full((len(paths.GOAL_SETS), paths.sub_goal_width(sub_goal)), np.inf, np.float32)
         high[:, : N_ACTIONS + 1] = 1.0
         boxes["sub_goal"] = spaces.Box(np.zeros_like(high), high, high.shape, np.float32)
+    if known_map:
+        boxes["known"] = spaces.Box(0, 1, (len(layout.KNOWN_CHANNELS), *size), np.uint8)
     return spaces.Dict(boxes)
 
 
@@ -70,16 +74,22 @@ class TeamArrays:
     :param scene: the task
     :param n_teams: number of teams
     :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param known_map: observe the key ``known``, too
     """
 
-    def __init__(self, scene: Scene, n_teams: int, sub_goal: str) -> None:
+    team_observation_keys: tuple[str, ...] = ("joint", "state")
+
+    def __init__(self, scene: Scene, n_teams: int, sub_goal: str, known_map: bool = False) -> None:
         self.scene = scene
         self.n_teams = n_teams
         self.n_agents = scene.n_agents
         self.sub_goal = sub_goal
+        self.known_map = False
         self.observation_space = observation_space(scene, sub_goal)
         self._started = False
         self._allocate()
+        if known_map:
+            self.show_known_map()
 
     def _allocate(self) -> None:
         scene, m, n = self.scene, self.n_teams, self.n_agents
@@ -194,8 +204,28 @@ class TeamArrays:
                 self.observations["sub_goal"],
             )
 
+    def show_known_map(self) -> None:
+        """Observe the key ``known`` from now on, if it is not observed yet.
+
+        It is the team's map: uint8 (n_teams, 2, height, width), the known free cells and the known
+        obstacles, see ``cells.KNOWN_CHANNELS``. Nothing else changes.
+        """
+        if self.known_map:
+            return
+        self.known_map = True
+        self.observation_space = observation_space(self.scene, self.sub_goal, True)
+        self.team_observation_keys = (*self.team_observation_keys, "known")
+        size = (self.n_teams, self.scene.height, self.scene.width, len(layout.KNOWN_CHANNELS))
+        self._known = np.zeros(size, np.uint8)
+        self.observations["known"] = np.moveaxis(self._known, -1, -3)
+        self.first_team["known"] = self.observations["known"][0]
+        if self._started:
+            kernels.observe_known(self._everyone, self.cells, self._border, self._known)
+
     def _observe(self, which: np.ndarray) -> None:
         kernels.observe_teams(which, *self._observe_arguments)
+        if self.known_map:
+            kernels.observe_known(which, self.cells, self._border, self._known)
         if self.sub_goal == "nearest":
             paths.nearest_sub_goals(which, *self._sub_goal_arguments)
         elif self.sub_goal == "assigned":
@@ -258,7 +288,12 @@ class TeamArrays:
 
     # Pickling (SuperSuit copies environments that way) would tear the views of one memory apart.
     def __getstate__(self) -> dict[str, Any]:
-        options = {"scene": self.scene, "n_teams": self.n_teams, "sub_goal": self.sub_goal}
+        options = {
+            "scene": self.scene,
+            "n_teams": self.n_teams,
+            "sub_goal": self.sub_goal,
+            "known_map": self.known_map,
+        }
         return {"options": options, "arrays": self.get_state() if self._started else None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from area_search import cells as layout
-from area_search import kernels
+from area_search import kernels, paths
 from area_search.arrays import TeamArrays
 from area_search.cells import N_ACTIONS
 from area_search.random_streams import seed_key
@@ -31,11 +31,11 @@ class BatchedAreaSearch(TeamArrays):
     :param n_teams: number of teams
     :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``; which path features
         (``area_search.paths``) join the observation
+    :param known_map: observe the team's map under the key ``known``, see :meth:`show_known_map`
     :param scene_options: fields of the scene to change
     :raises ValueError: if an option is unknown or out of range
     """
 
-    team_observation_keys = ("joint", "state")
     reward_component_names = REWARD_COMPONENTS
     metric_names = kernels.METRICS
 
@@ -44,11 +44,12 @@ class BatchedAreaSearch(TeamArrays):
         scene: Scene | str = "hard",
         n_teams: int = 1,
         sub_goal: str = "none",
+        known_map: bool = False,
         **scene_options: Any,
     ) -> None:
         if isinstance(n_teams, bool) or not isinstance(n_teams, int) or n_teams < 1:
             raise ValueError(f"n_teams must be a whole number of at least 1, got {n_teams!r}")
-        super().__init__(get_scene(scene, **scene_options), n_teams, sub_goal)
+        super().__init__(get_scene(scene, **scene_options), n_teams, sub_goal, known_map)
         self.possible_agents = [f"robot_{i}" for i in range(self.n_agents)]
         self.action_space = spaces.Discrete(N_ACTIONS)
         self._window: Window | None = None
@@ -165,6 +166,18 @@ class BatchedAreaSearch(TeamArrays):
         if roles.min() < 0 or roles.max() >= MAX_ROLES:
             raise ValueError(f"roles must be in 0..{MAX_ROLES - 1}, got {roles.tolist()}")
         self.roles[:] = roles
+
+    @property
+    def goal_nearness(self) -> dict[str, tuple[str, tuple[int, int]]]:
+        """Where a robot observes how near its goals are: goal set -> key, and index in its array.
+
+        The target comes first on a tie. Empty with ``sub_goal="none"``.
+        """
+        if self.sub_goal == "none":
+            return {}
+        # Behind the first moves, see ``area_search.paths``.
+        order = ("target", "frontier")
+        return {name: ("sub_goal", (paths.GOAL_SETS.index(name), N_ACTIONS)) for name in order}
 
     def _metrics_so_far(self, team: int) -> dict[str, float]:
         """Metrics of the running episode; ``metrics`` are those of the last step."""

@@ -24,6 +24,7 @@ BORDER = EXPLORED | OBSTACLE | KNOWN_OBSTACLE
 LOCAL_CHANNELS = ("obstacle", "frontier", "target", "robot")
 JOINT_CHANNELS = ("frontier", "target")
 STATE_CHANNELS = ("obstacle", "frontier", "target", "robot", "explored")
+KNOWN_CHANNELS = ("free", "obstacle")
 
 # Stop, then the paper's Move-forward, Turn-right, Move-backward, Turn-left as absolute moves.
 ACTIONS = ("stop", "up", "right", "down", "left")

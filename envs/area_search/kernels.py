@@ -350,3 +350,20 @@ def observe_teams(
                     local[m, i, dy, dx] = (
                         table[cells[m, top + dy, left + dx] & 15] & masks[dy * side + dx]
                     )
+
+
+@njit(cache=True)
+def observe_known(which: np.ndarray, cells: np.ndarray, border: int, known: np.ndarray) -> None:
+    """Write the team's map of some teams: where cells are known to be free, and to be obstacles.
+
+    :param which: bool (n_teams,)
+    :param known: uint8 (n_teams, height, width, 2), see ``cells.KNOWN_CHANNELS``: overwritten
+    """
+    for m in range(known.shape[0]):
+        if not which[m]:
+            continue
+        for row in range(known.shape[1]):
+            for column in range(known.shape[2]):
+                cell = cells[m, row + border, column + border]
+                known[m, row, column, 0] = (cell & (EXPLORED | OBSTACLE)) == EXPLORED
+                known[m, row, column, 1] = (cell & KNOWN_OBSTACLE) > 0

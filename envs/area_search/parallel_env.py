@@ -15,8 +15,6 @@ from area_search.render import Window, draw_frame
 from area_search.rewards import REWARD_COMPONENTS
 from area_search.scenes import Scene, get_scene, shown, unknown
 
-_TEAM_KEYS = BatchedAreaSearch.team_observation_keys
-
 ObsDict = dict[str, dict[str, np.ndarray]]
 InfoDict = dict[str, dict[str, Any]]
 
@@ -32,7 +30,8 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
       around the robot, from the team's map; ``joint`` (2, height, width) the team's frontier and
       known uncovered targets; ``position`` float32 (2,) row and column; ``state``
       (5, height, width) true obstacles, frontier, true uncovered targets, robots, explored, for
-      critics only; ``sub_goal`` float32, see ``area_search.paths``.
+      critics only; ``sub_goal`` float32, see ``area_search.paths``; with ``known_map``, ``known``
+      (2, height, width) the team's known free cells and known obstacles.
     * **Rewards**: ``alpha * R_e + beta * R_c`` (Eq. 2); the components are in
       ``infos[robot]["reward_components"]``.
     * **Infos**: ``reward_components``; ``metrics`` of the step: ``explo_paper``, ``explo_true``,
@@ -43,6 +42,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
 
     :param scene: a :class:`Scene` or the name of one
     :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param known_map: observe the team's map, too
     :param render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a pygame window)
     :param scene_options: fields of the scene to change, such as ``n_agents=8``
     :raises ValueError: if an option is unknown or out of range
@@ -54,7 +54,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         "render_fps": 5,
         "is_parallelizable": True,
     }
-    team_observation_keys = _TEAM_KEYS
+    team_observation_keys = BatchedAreaSearch.team_observation_keys
     reward_component_names = REWARD_COMPONENTS
     metric_names = kernels.METRICS
 
@@ -63,6 +63,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         scene: Scene | str = "hard",
         sub_goal: str = "none",
         render_mode: str | None = None,
+        known_map: bool = False,
         **scene_options: Any,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -71,7 +72,8 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         self.scene = get_scene(scene, **scene_options)
         self.sub_goal = sub_goal
         self.render_mode = render_mode
-        self._batch = BatchedAreaSearch(self.scene, 1, sub_goal)
+        self._batch = BatchedAreaSearch(self.scene, 1, sub_goal, known_map)
+        self.team_observation_keys = self._batch.team_observation_keys
         self.possible_agents = list(self._batch.possible_agents)
         self.agents: list[str] = []
         self._space = self._batch.observation_space
@@ -95,12 +97,17 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         """The space of :meth:`state`."""
         return self._space["state"]
 
+    @property
+    def goal_nearness(self) -> dict[str, tuple[str, tuple[int, int]]]:
+        """Where a robot observes how near its goals are, see ``BatchedAreaSearch``."""
+        return self._batch.goal_nearness
+
     def batched(self, n_teams: int) -> BatchedAreaSearch:
         """Return the same task for many teams at once, see ``make_team_vec_env``.
 
         :param n_teams: number of teams
         """
-        return BatchedAreaSearch(self.scene, n_teams, self.sub_goal)
+        return BatchedAreaSearch(self.scene, n_teams, self.sub_goal, self._batch.known_map)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -195,7 +202,9 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         # One copy of each array for the whole team: observations stay valid for ever, and the
         # team's maps are shared by its robots. Order "K" keeps the channels last in memory.
         arrays = {key: value.copy("K") for key, value in self._batch.first_team.items()}
-        own = [(key, array) for key, array in arrays.items() if key not in _TEAM_KEYS]
+        own = [
+            (key, array) for key, array in arrays.items() if key not in self.team_observation_keys
+        ]
         team = {}
         for i, agent in enumerate(self.possible_agents):
             observation = arrays.copy()

@@ -66,10 +66,18 @@ class ReferenceAreaSearch:
     :param seed: seed of the stream
     :param episode: number of the episode in the stream
     :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param known_map: observe the team's map, too
     """
 
-    def __init__(self, scene: Scene, seed: int, episode: int = 0, sub_goal: str = "none") -> None:
-        self.scene, self.sub_goal = scene, sub_goal
+    def __init__(
+        self,
+        scene: Scene,
+        seed: int,
+        episode: int = 0,
+        sub_goal: str = "none",
+        known_map: bool = False,
+    ) -> None:
+        self.scene, self.sub_goal, self.known_map = scene, sub_goal, known_map
         stream = ReferenceStream(seed, episode)
         self.all_cells = [(r, c) for r in range(scene.height) for c in range(scene.width)]
         seed_cell = (int(stream.unit() * scene.height), int(stream.unit() * scene.width))
@@ -233,6 +241,9 @@ class ReferenceAreaSearch:
             }
             if features is not None:
                 observation["sub_goal"] = features[i]
+            if self.known_map:
+                seen = (self.explored & self.free, self.explored - self.free)
+                observation["known"] = np.array([self._map(cells) for cells in seen], np.uint8)
             observations.append(observation)
         return observations
 

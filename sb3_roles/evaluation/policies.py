@@ -158,6 +158,8 @@ class PolicyController:
         known = self.policy.observation_space
         if self.role_control == NEAREST:
             self._set_rule(batch.goal_nearness)
+        if "known" in self.keys:
+            batch.show_known_map()
         for key in self.keys:
             if key not in batch.observations:
                 raise ValueError(

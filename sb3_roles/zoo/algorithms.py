@@ -10,8 +10,19 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
+from sb3_roles.baselines import CONTROLLER_NAMES
 from sb3_roles.common.names import closest
-from sb3_roles.zoo.ranges import Choice, Flag, Items, Number, Options, Range, Whole, schedule_start
+from sb3_roles.zoo.ranges import (
+    Choice,
+    Flag,
+    Items,
+    Number,
+    Options,
+    Range,
+    Text,
+    Whole,
+    schedule_start,
+)
 
 _TEAM_BUFFER = {"rollout_buffer_class": "sb3_roles.common.buffers:TeamRolloutBuffer"}
 _ROLE_POLICY = {"RolePolicy": "sb3_roles.hmappo.policies:RoleActorCriticPolicy"}
@@ -34,6 +45,7 @@ _OPTIMIZER = Options(
     }
 )
 
+_GOALS: dict[str, Range] = {"goal_key": Text(optional=True), "goal_prior": Number(0.0, 100.0)}
 _TEAM_POLICY: dict[str, Range] = {
     "actor_keys": _KEYS,
     "critic_keys": _KEYS,
@@ -49,13 +61,36 @@ _TEAM_POLICY: dict[str, Range] = {
     "precision": Choice(("auto", "fp32", "bf16")),
     "optimizer_kwargs": _OPTIMIZER,
 }
+# Of the critic and the optimizer: the actor is the graph.
+_GRAPH_POLICY: dict[str, Range] = {
+    **{
+        key: _TEAM_POLICY[key]
+        for key in (
+            "critic_keys",
+            "norm_layer",
+            "encoder",
+            "local_channels",
+            "joint_channels",
+            "state_channels",
+            "precision",
+            "optimizer_kwargs",
+        )
+    },
+    "n_hops": Whole(1, 1000),
+    "hop_width": Whole(1, 65536),
+    "head_arch": _WIDTHS,
+    "value_arch": _WIDTHS,
+}
 POLICY_ARGUMENTS: dict[str, dict[str, Range]] = {
     "TeamPolicy": {
         **_TEAM_POLICY,
         "actor_arch": _WIDTHS,
         "head_arch": _WIDTHS,
         "value_arch": _WIDTHS,
+        **_GOALS,
     },
+    "GNNPolicy": _GRAPH_POLICY,
+    "H2GNNPolicy": {**_GRAPH_POLICY, "n_heads": Whole(1, 1024)},
     "RolePolicy": {
         **_TEAM_POLICY,
         "role_arch": _WIDTHS,
@@ -65,6 +100,8 @@ POLICY_ARGUMENTS: dict[str, dict[str, Range]] = {
         "primitive_arch": _SOME_WIDTHS,
         "value_arch": _SOME_WIDTHS,
         "see_role": Flag(),
+        **_GOALS,
+        "other_goal_prior": Number(0.0, 100.0),
     },
     "RowPolicy": {"net_arch": _WIDTHS, "optimizer_kwargs": _OPTIMIZER},
     "RecurrentRowPolicy": {
@@ -242,6 +279,43 @@ ALGORITHMS: dict[str, Algorithm] = {
             "sb3_roles.mappo:MAPPO",
             "team",
             {"TeamPolicy": "sb3_roles.mappo.policies:TeamActorCriticPolicy"},
+            _MAPPO,
+            batch_in_rows=False,
+        ),
+        # Blumenkamp and Prorok's policy is MAPPO's with the networks of its configuration.
+        Algorithm(
+            "ecc",
+            "sb3_roles.mappo:MAPPO",
+            "team",
+            {"TeamPolicy": "sb3_roles.mappo.policies:TeamActorCriticPolicy"},
+            _MAPPO,
+            batch_in_rows=False,
+        ),
+        Algorithm(
+            "gnn",
+            "sb3_roles.gnn:GNN",
+            "team",
+            {"GNNPolicy": "sb3_roles.gnn.policies:GNNPolicy"},
+            {
+                "demonstrations": Text(optional=True),
+                "controller": Choice(CONTROLLER_NAMES),
+                "n_demonstrations": Whole(2, 1e6),
+                "validation_share": _UNIT,
+                "learning_rate": Number(0.0, 10.0),
+                "lr_decay": _UNIT,
+                "lr_decay_every": Whole(1, 1e9),
+                "batch_size": Whole(1, 1e6),
+                "patience": Whole(1, 1e6, optional=True),
+                "n_steps": Whole(1, 1e6),
+                "stats_window_size": Whole(1, 1e6),
+            },
+            batch_in_rows=False,
+        ),
+        Algorithm(
+            "h2gnn",
+            "sb3_roles.mappo:MAPPO",
+            "team",
+            {"H2GNNPolicy": "sb3_roles.gnn.policies:H2GNNPolicy"},
             _MAPPO,
             batch_in_rows=False,
         ),

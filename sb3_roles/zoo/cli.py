@@ -18,17 +18,22 @@ from sb3_roles.zoo.options import Parser, UsageError
 
 COMMANDS = (
     "sb3_roles.zoo.train",
+    "sb3_roles.zoo.demonstrate",
     "sb3_roles.zoo.simulate",
     "sb3_roles.zoo.evaluate",
     "sb3_roles.zoo.enjoy",
     "sb3_roles.zoo.curves",
+    "sb3_roles.zoo.records",
     "sb3_roles.zoo.bench",
 )
 EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
 
 
-def make_parser() -> Parser:
-    """Build the parser of all commands."""
+def make_parser(script: str | None = None) -> Parser:
+    """Build the parser of all commands.
+
+    :param script: the command that calls itself ``<script>.py`` in its messages
+    """
     parser = Parser(
         prog="sb3-roles",
         description="Multi-agent, role-hierarchical PPO and the area-search environment.",
@@ -37,23 +42,28 @@ def make_parser() -> Parser:
     subparsers = parser.add_subparsers(dest="command", metavar="command", required=True)
     for command in COMMANDS:
         import_module(command).add_parser(subparsers)
+    if script is not None:
+        subparsers.choices[script].prog = f"{script}.py"
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
     """Run one command.
 
     :param argv: arguments without the name of the program, ``sys.argv[1:]`` by default
-    :return: the exit code: 0, 2 after a usage error, 130 after Ctrl-C, 141 after a closed pipe
+    :param script: the command, where it is not the first argument: ``"train"`` for ``train.py``
+    :return: the exit code: 0, 2 after a usage error, 130 after Ctrl-C, 141 after a closed pipe, or
+        the command's own
     :raises SystemExit: after help, ``--version`` and a wrong command line
     """
     if hasattr(sys.stdout, "reconfigure"):
         # A terminal that can not show "±" gets "?", not a traceback.
         sys.stdout.reconfigure(errors="replace")
-    parser = make_parser()
+    parser = make_parser(script)
+    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
-            args = parser.parse_args(argv)
+            args = parser.parse_args(arguments if script is None else [script, *arguments])
             parser = args.parser
             code = args.run(args)
         finally:

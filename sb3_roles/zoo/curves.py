@@ -6,7 +6,10 @@ import csv
 import json
 import math
 from argparse import Namespace
-from collections import defaultdict
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any
@@ -23,8 +26,35 @@ EVALUATIONS_FILE = "evaluations.csv"
 _FRACTIONS = ("explo_paper", "explo_true", "cover", "t90_share")
 _STEPS = "env_steps"
 
-# Algorithm -> joint steps -> metric -> one value per run.
-Curves = dict[str, dict[int, dict[str, list[float]]]]
+
+@dataclass(frozen=True)
+class Run:
+    """The evaluations of one run.
+
+    :param steps: joint steps at which it was evaluated, increasing
+    :param values: metric -> one value for each of ``steps``, nan where it has none
+    """
+
+    steps: Sequence[int]
+    values: Mapping[str, Sequence[float]]
+
+    def reaches(self, step: int) -> bool:
+        """Whether ``step`` lies between the first and the last evaluation."""
+        return bool(self.steps) and self.steps[0] <= step <= self.steps[-1]
+
+    def at(self, metric: str, step: int) -> float:
+        """Return a metric at ``step``, on a straight line between the evaluations around it."""
+        after = bisect_left(self.steps, step)
+        values = self.values[metric]
+        if self.steps[after] == step:
+            return values[after]
+        first, last = self.steps[after - 1], self.steps[after]
+        share = (step - first) / (last - first)
+        return (1.0 - share) * values[after - 1] + share * values[after]
+
+
+# Label -> the runs of which the mean is taken.
+Curves = dict[str, list[Run]]
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -33,9 +63,16 @@ def add_parser(subparsers: Subparsers) -> None:
         "curves",
         help="learning curves of several runs",
         description="Print the held-out evaluations of runs over joint steps as a Markdown table, "
-        "mean [lowest .. highest] over the runs of each algorithm.",
+        "mean [lowest .. highest] over the runs of each label. Between two evaluations of a run a "
+        "straight line is taken: runs need not be evaluated at the same steps.",
     )
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders")
+    parser.add_argument(
+        "runs",
+        nargs="+",
+        metavar="[LABEL=]RUN",
+        help="run folders, or patterns such as 'logs/hmappo/*'; runs of one label are averaged, by "
+        "default those of one algorithm",
+    )
     parser.add_argument(
         "--metrics",
         nargs="+",
@@ -62,9 +99,9 @@ def run(args: Namespace) -> int:
     :return: exit code
     :raises UsageError: if a run has no evaluations, or no such metric
     """
-    curves = read_curves([Path(one) for one in args.runs], args.metrics)
+    curves = read_curves(args.runs, args.metrics)
     if args.json:
-        print(json.dumps(curves, indent=2))
+        print(json.dumps(_report(curves, args.metrics), indent=2))
     else:
         print("\n".join(_table(curves, args.metrics, args.every)))
     if args.plot:
@@ -72,44 +109,105 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def read_curves(runs: list[Path], metrics: list[str]) -> Curves:
-    """Collect the evaluations of runs, by algorithm.
+def read_curves(runs: Sequence[str], metrics: Sequence[str]) -> Curves:
+    """Collect the evaluations of runs, by label.
 
-    :param runs: run folders
+    :param runs: ``LABEL=RUN`` or ``RUN``, where RUN is a run folder or a pattern of some; without a
+        label, the algorithm is the label
     :param metrics: columns to read
-    :return: see ``Curves``; steps that not all runs of an algorithm have got to are left out
+    :return: see ``Curves``; a folder that is named twice is read once per label
     :raises UsageError: if a file is missing or damaged, or a metric is unknown
     """
-    curves: Curves = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-    n_runs: dict[str, int] = defaultdict(int)
-    for folder in runs:
-        path = folder / EVALUATIONS_FILE
-        if not path.is_file() or not (folder / CONFIG_FILE).is_file():
-            raise UsageError(f"{folder}: no run folder with {EVALUATIONS_FILE} and {CONFIG_FILE}")
-        algo = str(read_yaml(folder / CONFIG_FILE).get("algo"))
-        n_runs[algo] += 1
-        with open(path, newline="", encoding="utf-8") as file:
+    curves: Curves = {}
+    seen = set()
+    for label, folders in [_folders(text) for text in runs]:
+        for folder in folders:
+            config = folder / CONFIG_FILE
+            if not (folder / EVALUATIONS_FILE).is_file() or not config.is_file():
+                raise UsageError(
+                    f"{folder}: no run folder with {EVALUATIONS_FILE} and {CONFIG_FILE}"
+                )
+            name = label
+            if name is None:
+                content = read_yaml(config)
+                name = str(content.get("algo")) if isinstance(content, dict) else "unknown"
+            if (name, folder.resolve()) not in seen:
+                seen.add((name, folder.resolve()))
+                curves.setdefault(name, []).append(_read(folder / EVALUATIONS_FILE, metrics))
+    return curves
+
+
+def _folders(text: str) -> tuple[str | None, list[Path]]:
+    """Return the label and the folders of one argument."""
+    label, equals, pattern = text.partition("=")
+    # A folder's name may hold an equals sign, too.
+    if not equals or Path(text).exists():
+        label, pattern = "", text
+    elif not label.strip() or not pattern:
+        raise UsageError(f"argument RUN: must be RUN or LABEL=RUN, got {text!r}")
+    if Path(pattern).exists():
+        return label.strip() or None, [Path(pattern)]
+    found = sorted(path for path in map(Path, glob(pattern)) if path.is_dir())
+    if not found:
+        raise UsageError(f"{pattern}: no such run folder")
+    # Runs are numbered: _10 comes after _9.
+    found.sort(key=lambda path: (len(path.name), path.name))
+    return label.strip() or None, found
+
+
+def _read(path: Path, metrics: Sequence[str]) -> Run:
+    with open(path, newline="", encoding="utf-8", errors="replace") as file:
+        try:
             rows = list(csv.DictReader(file))
-        for row in rows:
-            for metric in metrics:
-                if metric not in row:
-                    raise UsageError(f"{path}: {closest('metric', metric, row)}")
-                try:
-                    value = float(row[metric] or "nan")
-                    curves[algo][int(row[_STEPS])][metric].append(value)
-                except (TypeError, ValueError):
-                    raise UsageError(f"{path}: a row is damaged: {dict(row)}") from None
+        except csv.Error as error:
+            raise UsageError(f"{path}: {error}") from None
+    by_step: dict[int, list[float]] = {}
+    for row in rows:
+        for metric in (_STEPS, *metrics):
+            if metric not in row:
+                raise UsageError(f"{path}: {closest('metric', metric, map(str, row))}")
+        try:
+            by_step[int(row[_STEPS])] = [float(row[metric] or "nan") for metric in metrics]
+        except (TypeError, ValueError):
+            raise UsageError(f"{path}: a row is damaged: {dict(row)}") from None
+    if not by_step:
+        raise UsageError(f"{path}: no evaluation yet")
+    steps = sorted(by_step)
+    return Run(
+        steps, {name: [by_step[step][k] for step in steps] for k, name in enumerate(metrics)}
+    )
+
+
+def _values(runs: Sequence[Run], metric: str, step: int) -> list[float]:
+    """Return a metric of all runs; empty before the first evaluation of one and after the last."""
+    if not all(run.reaches(step) for run in runs):
+        return []
+    return [run.at(metric, step) for run in runs]
+
+
+def _common_steps(runs: Sequence[Run]) -> list[int]:
+    """All steps at which one of the runs was evaluated, while all of them were trained."""
+    steps = sorted({step for run in runs for step in run.steps})
+    return [step for step in steps if all(run.reaches(step) for run in runs)]
+
+
+def _report(curves: Curves, metrics: Sequence[str]) -> dict[str, Any]:
+    """Return label -> joint steps -> metric -> one value per run, null where it has none."""
     return {
-        algo: {
-            steps: dict(values)
-            for steps, values in sorted(by_step.items())
-            if all(len(values[metric]) == n_runs[algo] for metric in metrics)
+        label: {
+            step: {
+                metric: [
+                    None if math.isnan(value) else value for value in _values(runs, metric, step)
+                ]
+                for metric in metrics
+            }
+            for step in _common_steps(runs)
         }
-        for algo, by_step in curves.items()
+        for label, runs in curves.items()
     }
 
 
-def _cell(metric: str, values: list[float]) -> str:
+def _cell(metric: str, values: Sequence[float]) -> str:
     scale, suffix = (100.0, " %") if metric in _FRACTIONS else (1.0, "")
     known = [scale * value for value in values if not math.isnan(value)]
     if not known:
@@ -117,25 +215,32 @@ def _cell(metric: str, values: list[float]) -> str:
     return f"{mean(known):.1f}{suffix} [{min(known):.1f} .. {max(known):.1f}]"
 
 
-def _table(curves: Curves, metrics: list[str], every: float) -> list[str]:
-    columns = [(algo, metric) for algo in curves for metric in metrics]
+def _table(curves: Curves, metrics: Sequence[str], every: float) -> list[str]:
+    columns = [(label, metric) for label in curves for metric in metrics]
+    # A label is the user's own text.
+    names = [f"{label} {metric}".replace("|", "\\|") for label, metric in columns]
     lines = [
-        "| joint steps | " + " | ".join(f"{algo} {metric}" for algo, metric in columns) + " |",
+        "| joint steps | " + " | ".join(names) + " |",
         "|---" * (len(columns) + 1) + "|",
     ]
-    printed = 0
-    for steps in sorted({steps for by_step in curves.values() for steps in by_step}):
-        if steps < printed + every:
-            continue
-        printed = int(steps // every * every)
-        cells = [
-            _cell(metric, curves[algo].get(steps, {}).get(metric, [])) for algo, metric in columns
-        ]
-        lines.append(f"| {steps:,} | " + " | ".join(cells) + " |")
+    for step in _table_steps(curves, every):
+        cells = [_cell(metric, _values(curves[label], metric, step)) for label, metric in columns]
+        lines.append(f"| {step:,} | " + " | ".join(cells) + " |")
     return lines
 
 
-def _plot(curves: Curves, metrics: list[str], file: Path) -> None:
+def _table_steps(curves: Curves, every: float) -> list[int]:
+    """For each ``every`` joint steps, the first evaluation at which most labels have a value."""
+    chosen: dict[int, tuple[int, int]] = {}
+    for step in sorted({step for runs in curves.values() for step in _common_steps(runs)}):
+        known = sum(all(run.reaches(step) for run in runs) for runs in curves.values())
+        row = int(step // every)
+        if row and known > chosen.get(row, (0, 0))[0]:
+            chosen[row] = (known, step)
+    return [step for _, step in chosen.values()]
+
+
+def _plot(curves: Curves, metrics: Sequence[str], file: Path) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -146,10 +251,15 @@ def _plot(curves: Curves, metrics: list[str], file: Path) -> None:
         figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True
     ):
         scale = 100.0 if metric in _FRACTIONS else 1.0
-        for style, (algo, by_step) in zip(styles * len(curves), curves.items(), strict=False):
-            steps = [n / 1000.0 for n in by_step]
-            values: list[Any] = [[scale * v for v in one[metric]] for one in by_step.values()]
-            axes.plot(steps, [mean(v) for v in values], style, label=algo)
+        for style, (label, runs) in zip(styles * len(curves), curves.items(), strict=False):
+            points = [(step, _values(runs, metric, step)) for step in _common_steps(runs)]
+            known = [
+                (step / 1000.0, [scale * value for value in values if not math.isnan(value)])
+                for step, values in points
+                if not all(map(math.isnan, values))
+            ]
+            steps, values = [step for step, _ in known], [values for _, values in known]
+            axes.plot(steps, [mean(v) for v in values], style, label=label)
             axes.fill_between(steps, [min(v) for v in values], [max(v) for v in values], alpha=0.2)
         axes.set_xlabel("joint steps (thousands)")
         axes.set_ylabel(f"{metric} (%)" if metric in _FRACTIONS else metric)

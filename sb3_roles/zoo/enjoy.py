@@ -11,12 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import (
+    DEVICES,
     MAX_SEED,
     KeyValues,
     UsageError,
     int_text,
     key_value,
+    one_of,
     output_file,
     positive_number,
     whole_number,
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
     from sb3_roles.zoo.playback import Show
 
+_ALGO = "hmappo"
 _PERCENT = ("explo_paper", "explo_true", "cover")
 
 
@@ -57,46 +61,34 @@ class LoadedRun:
             raise UsageError(f"{self.folder}: {error}") from error
 
 
-def find_run(logs: Path, algo: str, env: str, exp_id: int = 0) -> Path:
-    """Find a run folder, ``<logs>/<algo>/<env>_<id>``.
-
-    :param logs: folder of all runs
-    :param algo: name of the algorithm
-    :param env: name of the environment
-    :param exp_id: number of the run; 0 for the latest
-    :raises UsageError: if there is none
-    """
-    from sb3_roles.zoo.environments import folder_name
-
-    prefix = f"{folder_name(env)}_"
-    runs = {
-        int(path.name.removeprefix(prefix)): path
-        for path in (logs / algo).glob("*")
-        if path.name.startswith(prefix) and path.name.removeprefix(prefix).isdecimal()
-    }
-    if runs and exp_id in (0, *runs):
-        return runs[exp_id or max(runs)]
-    wanted = f"run {exp_id}" if exp_id else "run"
-    there = f"there are {', '.join(map(str, sorted(runs)))}" if runs else "there is none"
-    raise UsageError(f"no {wanted} of {algo} on {env} in {str(logs)!r}: {there}")
-
-
-def load_run(folder: Path, best: bool = False, device: str = "auto") -> LoadedRun:
-    """Load the policy of a run folder.
+def load_run(
+    folder: Path,
+    best: bool = False,
+    device: str = "auto",
+    env: str | None = None,
+    algo: str | None = None,
+) -> LoadedRun:
+    """Load the policy of a run folder; no code of the folder runs.
 
     :param folder: the run
     :param best: the best policy of its evaluations instead of the last one
     :param device: where the policy computes
-    :raises UsageError: if it is no run folder, or damaged
+    :param env: the run's environment, which must be given for ``module:factory``
+    :param algo: the run's algorithm; may be left out
+    :raises UsageError: if it is no run folder, damaged, or of another algorithm or environment
     """
     from sb3_roles.zoo.config import read_run_config
+    from sb3_roles.zoo.environments import check_named
 
     config = read_run_config(folder)
+    check_named(folder, config["env"], env)
+    if algo is not None and config["algo"] != algo:
+        raise UsageError(f"{folder}: its algorithm is {config['algo']}, not {algo}")
 
     # Torch takes its time to import: not before the folder is known to be a run.
     from sb3_roles.zoo.models import load_model
 
-    return LoadedRun(folder, config, load_model(folder, best=best, device=device))
+    return LoadedRun(folder, config, load_model(folder, best, device, env))
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -107,9 +99,15 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Play episodes with a trained policy and print their metrics; in a window "
         "where there is a display, or into a video.",
     )
-    parser.add_argument("--algo", default="hmappo", metavar="NAME", help="that was trained")
     parser.add_argument(
-        "--env", default="area-search-v0", metavar="NAME", help="environment, or module:factory"
+        "--algo", default=None, metavar="NAME", help=f"that was trained (default: {_ALGO})"
+    )
+    parser.add_argument(
+        "--env",
+        default=None,
+        metavar="ID",
+        help="environment, or module:factory of one's own, which is imported and called "
+        f"(default: {AREA_SEARCH})",
     )
     parser.add_argument(
         "-f",
@@ -166,7 +164,13 @@ def add_play_options(parser: Any) -> None:
     parser.add_argument(
         "--no-communication", action="store_true", help="no messages between robots"
     )
-    parser.add_argument("--device", default="auto", metavar="NAME", help="cpu, cuda, or auto")
+    parser.add_argument(
+        "--device",
+        type=one_of("device", DEVICES),
+        default="auto",
+        metavar="NAME",
+        help="cpu, cuda, or auto",
+    )
 
 
 def run(args: Namespace) -> int:
@@ -178,21 +182,22 @@ def run(args: Namespace) -> int:
     """
     from sb3_roles.zoo.algorithms import get_algorithm
     from sb3_roles.zoo.config import CONFIG_FILE
+    from sb3_roles.zoo.run_folder import find_run
 
     try:
-        get_algorithm(args.algo)
+        get_algorithm(args.algo or _ALGO)
     except ValueError as error:
         raise UsageError(f"argument --algo: {error}") from None
     if args.video is not None:
         check_video(args.video)
     folder = args.folder
     if not (folder / CONFIG_FILE).is_file():
-        folder = find_run(folder, args.algo, args.env, args.exp_id)
-    loaded = load_run(folder, args.load_best, args.device)
+        folder = find_run(folder, args.algo or _ALGO, args.env or AREA_SEARCH, args.exp_id)
+    loaded = load_run(folder, args.load_best, args.device, args.env, args.algo)
     controller = loaded.controller(not args.stochastic, not args.no_communication)
     config = _changed(loaded.config, args)
     print(f"{config['algo']} on {config['env']}, {loaded.folder}")
-    with _display(args) as show:
+    with _display(args, f"{config['algo']} on {config['env']}") as show:
         outcomes = []
         for episode, (metrics, roles) in enumerate(_episodes(controller, config, args, show)):
             outcomes.append(metrics)
@@ -208,7 +213,7 @@ def run(args: Namespace) -> int:
 
 def _changed(config: Mapping[str, Any], args: Namespace) -> dict[str, Any]:
     """Return the configuration of the run with the changes of the command line."""
-    from sb3_roles.zoo.environments import AREA_SEARCH, env_problems
+    from sb3_roles.zoo.environments import env_problems
 
     options = dict(config.get("env_kwargs") or {})
     if config["env"] == AREA_SEARCH:
@@ -228,14 +233,18 @@ def _episodes(
     controller: PolicyController, config: Mapping[str, Any], args: Namespace, show: Show | None
 ) -> Iterator[tuple[dict[str, float], np.ndarray]]:
     from sb3_roles.common.team_vec_env import team_seeds
-    from sb3_roles.zoo.environments import AREA_SEARCH, env_factory, scene_of_run
+    from sb3_roles.zoo.environments import env_factory, scene_of_run
     from sb3_roles.zoo.playback import play_env, play_scene
 
     try:
         if config["env"] == AREA_SEARCH:
+            from sb3_roles.evaluation.episodes import held_out_seed
+
             scene, links = scene_of_run(config), controller.communicate
+            # The episodes that `evaluate --seed` scores.
+            seed = held_out_seed(args.seed)
             for episode in range(args.episodes):
-                yield play_scene(controller, scene, args.seed, episode, show, links)
+                yield play_scene(controller, scene, seed, episode, show, links)
             return
         drawn = {} if show is None else {"render_mode": "rgb_array"}
         env = env_factory(config["env"], {**config["env_kwargs"], **drawn})()
@@ -249,7 +258,7 @@ def _episodes(
 
 
 @contextmanager
-def _display(args: Namespace) -> Iterator[Show | None]:
+def _display(args: Namespace, title: str) -> Iterator[Show | None]:
     """Give what takes the frames: a video, a window, or None where nothing is drawn."""
     if args.video is not None:
         with VideoWriter(args.video, args.fps) as video:
@@ -262,7 +271,7 @@ def _display(args: Namespace) -> Iterator[Show | None]:
         return
     from area_search.render import Window
 
-    window = Window(f"{args.algo} on {args.env}")
+    window = Window(title)
 
     def show(frame: np.ndarray) -> None:
         if not window.show(frame, args.fps):
@@ -299,14 +308,3 @@ def _line(
         if len(roles) > 1:
             parts.append(f"role switches {100 * (roles[1:] != roles[:-1]).mean():.0f} %")
     return ", ".join(parts)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command, for ``enjoy.py``.
-
-    :param argv: arguments without the name of the program
-    :return: exit code
-    """
-    from sb3_roles.zoo.cli import main as run_command
-
-    return run_command(["enjoy", *(sys.argv[1:] if argv is None else argv)])

@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -34,11 +35,15 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
     """
     if env not in ENVIRONMENTS:
         if _FACTORY.fullmatch(env):
-            return []
+            wrong = [key for key in env_kwargs if not isinstance(key, str)]
+            return [f"env_kwargs: {key!r} is no name of an argument" for key in wrong]
         return [closest("environment", env, ENVIRONMENTS) + ", or module:factory"]
     options = dict(env_kwargs)
     name, sub_goal = options.pop("scene", "hard"), options.pop("sub_goal", "none")
+    known_map = options.pop("known_map", False)
     found = []
+    if not isinstance(known_map, bool):
+        found.append(f"env_kwargs: known_map must be true or false, got {known_map!r}")
     if sub_goal not in SUB_GOALS:
         found.append(f"env_kwargs: {closest('sub_goal', sub_goal, SUB_GOALS)}")
     if not isinstance(name, str) or name not in SCENES:
@@ -46,7 +51,7 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
     known = [field.name for field in fields(SCENES[name]) if field.name != "name"]
     for key in options:
         if key not in known:
-            names = ["scene", "sub_goal", *known]
+            names = ["scene", "sub_goal", "known_map", *known]
             found.append(closest("key in env_kwargs", key, names))
     single = []
     for key, value in options.items():
@@ -66,6 +71,26 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
     return found + single
 
 
+def check_named(where: object, env: str, named: str | None) -> None:
+    """Refuse the environment of a file that is code, unless the user names it as well.
+
+    A run folder may come from anybody: what its configuration calls ``module:factory`` must not be
+    imported because of that alone.
+
+    :param where: the file or folder, for the message
+    :param env: the environment that it asks for
+    :param named: the environment that the user asks for; None if there is none
+    :raises UsageError: if they differ, or ``env`` is code that nobody named
+    """
+    if named is not None and named != env:
+        raise UsageError(f"{where}: its environment is {env}, not {named}")
+    if named is None and env not in ENVIRONMENTS:
+        raise UsageError(
+            f"{where}: its environment is code, to be imported and called: add --env {env} if you "
+            "trust it"
+        )
+
+
 def scene_of_run(config: Mapping[str, Any]) -> Scene:
     """Return the scene of a configuration for area search.
 
@@ -73,6 +98,7 @@ def scene_of_run(config: Mapping[str, Any]) -> Scene:
     """
     options = dict(config["env_kwargs"])
     options.pop("sub_goal", None)
+    options.pop("known_map", None)
     return get_scene(options.pop("scene", "hard"), **options)
 
 
@@ -81,7 +107,7 @@ def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:
 
     :param env: a name of :data:`ENVIRONMENTS`, or ``module:factory``
     :param env_kwargs: arguments of the environment
-    :return: a function without arguments, tried once
+    :return: a function without arguments, tried once; what that made is closed
     :raises UsageError: if it can not be imported, or does not make a PettingZoo ``ParallelEnv``
     """
     from pettingzoo import ParallelEnv
@@ -109,6 +135,9 @@ def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:
             f"--env {env}: {name} must make a pettingzoo.ParallelEnv, it makes "
             f"{type(made).__name__}"
         )
+    # Not every environment can be closed before its first reset.
+    with suppress(Exception):
+        made.close()
     return make
 
 

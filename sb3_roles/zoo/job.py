@@ -7,36 +7,33 @@ import sys
 import time
 import warnings
 from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import (
     HumanOutputFormat,
     KVWriter,
     Logger,
+    SummaryWriter,
     TensorBoardOutputFormat,
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
-from sb3_roles.common.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    CheckpointFolder,
-    write_checkpoint,
-)
+from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+from sb3_roles.common.progress_callback import TeamProgressBar
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.evaluation.callback import EvaluationCallback
+from sb3_roles.evaluation.evaluators import SceneEvaluator, VecEnvEvaluator
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run
-from sb3_roles.zoo.models import complete, make_env, make_model
+from sb3_roles.zoo.models import check_device, complete, make_env, make_model, steps_of
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.run_folder import (
-    BEST_FILE,
     CHECKPOINTS,
     RunLock,
     new_run,
@@ -63,8 +60,11 @@ def run_job(job: Mapping[str, Any]) -> int:
     :raises TrainingFailed: if a loss or reward is not finite, or the environment misbehaves
     """
     config, options = job["config"], job["options"]
-    if options["device"] == "cuda" and not th.cuda.is_available():
-        raise UsageError("--device cuda: torch finds no GPU")
+    check_device(options["device"])
+    if options["tensorboard_log"] is not None:
+        if SummaryWriter is None:
+            raise UsageError("--tensorboard-log: install sb3_roles[tensorboard] to write its files")
+        Path(options["tensorboard_log"]).mkdir(parents=True, exist_ok=True)
     if options["num_threads"] is not None:
         th.set_num_threads(options["num_threads"])
     # Before the folder is made: a wrong environment must leave nothing behind.
@@ -82,73 +82,80 @@ def run_job(job: Mapping[str, Any]) -> int:
 
 def _open_run(job: Mapping[str, Any]) -> tuple[Path, RunLock]:
     """Make, or find, the run folder of a job, and lock it."""
-    options = job["options"]
-    command = [Path(sys.argv[0]).name, *sys.argv[1:]]
     if job["resume"] is not None:
         path = Path(job["resume"])
-        lock = RunLock(path)
-        note_command(path, command)
-        # A new n_timesteps is the run's from now on.
-        write_yaml(path / CONFIG_FILE, job["config"])
-        return path, lock
-    config = job["config"]
+        return path, RunLock(path)
+    config, options = job["config"], job["options"]
     path = new_run(Path(options["log_folder"]), config["algo"], config["env"])
     lock = RunLock(path)
     args = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
     # A resumed run shall add in the same order, wherever it is resumed.
     args["num_threads"] = th.get_num_threads()
-    write_description(path, complete(config), args, command)
+    write_description(path, complete(config), args, _command())
     return path, lock
+
+
+def _command() -> list[str]:
+    return [Path(sys.argv[0]).name, *sys.argv[1:]]
 
 
 def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> int:
     config, options = job["config"], job["options"]
     checkpoints = CheckpointFolder(run / CHECKPOINTS)
     checkpoints.prepare()
-    resume = None if job["resume"] is None else _read_newest(checkpoints, model, config)
-    log = CsvLog(run / "progress.csv")
-    model.set_logger(_logger(run, log, config, options))
-    callbacks: list[Any] = [TeamMetricsCallback()]
-    if get_algorithm(config["algo"]).wrapper == "role":
-        callbacks.append(RoleCallback(path=run / "roles.csv"))
-    if options["eval_freq"]:
-        callbacks.append(
-            EvaluationCallback(
-                eval_freq=options["eval_freq"],
-                n_episodes=options["eval_episodes"],
-                seed=_PERIODIC_SEED,
-                evaluate=make_evaluate(config, options["eval_episodes"], _PERIODIC_SEED),
-                folder=run,
-                save=save_best,
-                verbose=options["verbose"],
-            )
-        )
-    _print_start(run, model, config, resume)
+    resume, begun = None, 0
+    if job["resume"] is not None:
+        resume, begun = _read_newest(checkpoints, model, config)
+        if options.get("n_timesteps", begun) < begun:
+            wanted = options["n_timesteps"]
+            raise UsageError(f"{run} has {begun} joint steps already, more than -n {wanted}")
+
     stop = StopSignals()
-    try:
-        with stop.caught():
-            train(
-                model,
-                config["n_timesteps"],
-                checkpoints,
-                stop,
-                callbacks,
-                stateful=[log, *callbacks],
-                config=config,
-                resume=resume,
-                save_freq=options["save_freq"],
-                log_interval=options["log_interval"],
-                progress_bar=options["progress"],
-            )
-    except CheckpointError as error:
-        raise UsageError(f"{run}: {error}") from error
-    except (FloatingPointError, ValueError) as error:
-        # Losses, rewards and observations that are not finite, teams that fall apart.
-        if options["verbose"] > 1:
-            raise
-        raise TrainingFailed(f"{run}: {' '.join(str(error).split())}") from error
+    with ExitStack() as stack:
+        log = CsvLog(run / "progress.csv")
+        logger = _logger(run, log, config, options)
+        stack.callback(logger.close)
+        model.set_logger(logger)
+        callbacks = _callbacks(run, model, config, options, stack)
+        _print_start(run, model, config, None if resume is None else begun)
+
+        def begin() -> None:
+            if resume is not None:
+                # A new n_timesteps is the run's from now on.
+                write_yaml(run / CONFIG_FILE, config)
+                note_command(run, _command())
+
+        bar = [TeamProgressBar()] if options["progress"] else []
+        try:
+            with stop.caught():
+                train(
+                    model,
+                    config["n_timesteps"],
+                    checkpoints,
+                    stop,
+                    [*callbacks, *bar],
+                    # An algorithm may know more than weights and counters.
+                    stateful=[log, *callbacks, *([model] if hasattr(model, "get_state") else [])],
+                    config=config,
+                    resume=resume,
+                    save_freq=options["save_freq"],
+                    log_interval=options["log_interval"],
+                    begin=begin,
+                )
+        except CheckpointError as error:
+            raise UsageError(f"{run}: {error}") from error
+        except (FloatingPointError, ValueError) as error:
+            # Losses, rewards and observations that are not finite, teams that fall apart.
+            if options["verbose"] > 1:
+                raise
+            raise TrainingFailed(f"{run}: {' '.join(str(error).split())}") from error
+        except RuntimeError as error:
+            # Torch's way to say so, on a CPU and on a GPU.
+            if "memory" not in str(error):
+                raise
+            raise MemoryError(" ".join(str(error).split())) from error
     steps = model.num_timesteps // find_team_env(model.env).n_agents
-    print(f"{run}: {steps} joint steps, {len(checkpoints.paths())} checkpoints", flush=True)
+    print(f"{run}: {steps} joint steps; checkpoints: {len(checkpoints.paths())}", flush=True)
     if stop.received is not None:
         print(f"stopped; to go on: train.py --resume {run}", flush=True)
         return stop.exit_code
@@ -156,29 +163,60 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
     return 0
 
 
+def _callbacks(
+    run: Path,
+    model: OnPolicyAlgorithm,
+    config: Mapping[str, Any],
+    options: Mapping[str, Any],
+    stack: ExitStack,
+) -> list[Any]:
+    window = model._stats_window_size
+    callbacks: list[Any] = [TeamMetricsCallback(window)]
+    if get_algorithm(config["algo"]).wrapper == "role":
+        callbacks.append(RoleCallback(window, run / "roles.csv"))
+    if options["eval_freq"]:
+        n_episodes = options["eval_episodes"]
+        evaluation = EvaluationCallback(
+            eval_freq=options["eval_freq"],
+            n_episodes=n_episodes,
+            seed=_PERIODIC_SEED,
+            evaluate=make_evaluate(config, n_episodes, _PERIODIC_SEED),
+            folder=run,
+            verbose=options["verbose"],
+        )
+        stack.callback(evaluation.close)
+        callbacks.append(evaluation)
+    return callbacks
+
+
 def _read_newest(
     checkpoints: CheckpointFolder, model: OnPolicyAlgorithm, config: Mapping[str, Any]
-) -> Checkpoint:
+) -> tuple[Checkpoint, int]:
+    """Read where a run was, and say what may keep it from going on bit for bit.
+
+    :return: the checkpoint and its joint steps
+    """
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             _, checkpoint = checkpoints.newest()
+        begun = steps_of(checkpoint, "env_steps")
     except CheckpointError as error:
         raise UsageError(str(error)) from error
     for warning in caught:
         print(f"warning: {warning.message}", flush=True)
     assert model.env is not None
-    # Threads are chosen here, the rest is what it is.
-    saved = dict(checkpoint.manifest.get("machine", {}))
+    machine, trained = (checkpoint.manifest.get(name) for name in ("machine", "config"))
+    saved = machine if isinstance(machine, dict) else {}
     reasons = snapshot.differences(saved, snapshot.machine_facts(model.device))
     gap = snapshot.env_gap(model.env)
     reasons += [] if gap is None else [gap]
-    before = checkpoint.manifest.get("config", {}).get("n_timesteps")
+    before = trained.get("n_timesteps") if isinstance(trained, dict) else None
     if before != config["n_timesteps"]:
         reasons.append(f"n_timesteps was {before}, is {config['n_timesteps']}")
     if reasons:
         print(f"not bit-exact: {'; '.join(reasons)}", flush=True)
-    return checkpoint
+    return checkpoint, begun
 
 
 def _logger(
@@ -188,35 +226,21 @@ def _logger(
     if options["verbose"] and not options["progress"]:
         writers.append(HumanOutputFormat(sys.stdout))
     if options["tensorboard_log"] is not None:
-        try:
-            name = f"{config['algo']}_{folder_name(run.name)}"
-            writers.append(TensorBoardOutputFormat(str(Path(options["tensorboard_log"]) / name)))
-        except AssertionError as error:
-            raise UsageError(f"--tensorboard-log: {error}") from error
+        name = f"{config['algo']}_{folder_name(run.name)}"
+        writers.append(TensorBoardOutputFormat(str(Path(options["tensorboard_log"]) / name)))
     return Logger(str(run), writers)
 
 
-def save_best(model: BaseAlgorithm, folder: Path, record: Mapping[str, Any]) -> None:
-    """Write the best policy's weights for ``load_model(run, best=True)``.
-
-    :param model: the model
-    :param folder: ``best/`` of the run
-    :param record: its scores
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    manifest = {"record": dict(record), "agent_steps": model.num_timesteps}
-    write_checkpoint(folder / BEST_FILE, manifest, model.policy.state_dict())
-
-
-def make_evaluate(config: Mapping[str, Any], n_episodes: int, seed: int) -> Any:
+def make_evaluate(
+    config: Mapping[str, Any], n_episodes: int, seed: int
+) -> SceneEvaluator | VecEnvEvaluator:
     """Make what evaluates a model on held-out episodes of its task.
 
     :param config: checked
     :param n_episodes: team episodes
     :param seed: of the held-out stream
+    :return: a function of the model; to be closed
     """
-    from sb3_roles.evaluation.evaluators import SceneEvaluator, VecEnvEvaluator
-
     if config["env"] == AREA_SEARCH:
         return SceneEvaluator(scene_of_run(config), n_episodes, seed)
     env = make_env(config, min(_MAX_EVAL_TEAMS, n_episodes))
@@ -226,7 +250,8 @@ def make_evaluate(config: Mapping[str, Any], n_episodes: int, seed: int) -> Any:
 def _evaluate(
     run: Path, model: OnPolicyAlgorithm, config: Mapping[str, Any], n_episodes: int
 ) -> None:
-    scores = make_evaluate(config, n_episodes, _FINAL_SEED)(model)
+    with closing(make_evaluate(config, n_episodes, _FINAL_SEED)) as evaluate:
+        scores = evaluate(model)
     write_yaml(run / "evaluation.yml", {"episodes": n_episodes, "scores": dict(scores)})
     shown = ("explo_paper", "explo_true", "cover")
     if config["env"] == AREA_SEARCH:
@@ -237,15 +262,15 @@ def _evaluate(
 
 
 def _print_start(
-    run: Path, model: OnPolicyAlgorithm, config: Mapping[str, Any], resume: Checkpoint | None
+    run: Path, model: OnPolicyAlgorithm, config: Mapping[str, Any], resumed_at: int | None
 ) -> None:
     team_env = find_team_env(model.env)
-    begun = 0 if resume is None else resume.manifest.get("env_steps", 0)
     print(
-        f"{'resuming' if resume else 'training'} {config['algo']} on {config['env']}: "
+        f"{'training' if resumed_at is None else 'resuming'} {config['algo']} on {config['env']}: "
         f"{team_env.n_teams} teams of {team_env.n_agents} ({type(team_env).__name__}), joint steps "
-        f"{begun} to {config['n_timesteps']}, seed {config['seed']}, {model.device.type}, "
-        f"{th.get_num_threads()} threads, OMP_WAIT_POLICY={os.environ.get('OMP_WAIT_POLICY')}\n"
+        f"{resumed_at or 0} to {config['n_timesteps']}, seed {config['seed']}, "
+        f"{model.device.type}, {th.get_num_threads()} threads, "
+        f"OMP_WAIT_POLICY={os.environ.get('OMP_WAIT_POLICY')}\n"
         f"run folder {run}, {time.strftime('%Y-%m-%d %H:%M:%S')}",
         flush=True,
     )

@@ -12,17 +12,23 @@ import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder, read_checkpoint
+from sb3_roles.common.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    CheckpointFolder,
+    read_checkpoint,
+)
 from sb3_roles.common.role_wrapper import RoleWrapper
 from sb3_roles.common.snapshot import load_weights
 from sb3_roles.common.team_vec_env import make_team_vec_env
 from sb3_roles.common.team_wrapper import TeamWrapper, find_team_env
+from sb3_roles.evaluation.callback import WEIGHTS_FILE
 from sb3_roles.zoo.algorithms import POLICY_ARGUMENTS, get_algorithm
 from sb3_roles.zoo.config import read_run_config
-from sb3_roles.zoo.environments import AREA_SEARCH, env_factory
+from sb3_roles.zoo.environments import AREA_SEARCH, check_named, env_factory
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ranges import Range
-from sb3_roles.zoo.run_folder import BEST, BEST_FILE, CHECKPOINTS
+from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS
 
 
 def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
@@ -56,6 +62,16 @@ def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
     return OwnViewWrapper(roles)
 
 
+def check_device(device: str) -> None:
+    """Refuse a GPU that is not there; SB3 would silently take the CPU.
+
+    :param device: see ``options.DEVICES``
+    :raises UsageError: if torch finds no GPU
+    """
+    if device == "cuda" and not th.cuda.is_available():
+        raise UsageError("--device cuda: torch finds no GPU")
+
+
 def make_model(
     config: Mapping[str, Any], env: VecEnv, device: str = "auto", verbose: int = 0
 ) -> OnPolicyAlgorithm:
@@ -65,8 +81,10 @@ def make_model(
     :param env: of :func:`make_env`
     :param device: where to train
     :param verbose: see the algorithm
-    :raises UsageError: if the configuration and the environment do not fit
+    :raises UsageError: if the configuration and the environment do not fit, or there is no such
+        device
     """
+    check_device(device)
     algorithm = get_algorithm(config["algo"])
     arguments = algorithm.arguments(config, find_team_env(env).n_agents)
     try:
@@ -74,7 +92,7 @@ def make_model(
             algorithm.policy(config["policy"]),
             env,
             **arguments,
-            seed=config["seed"] % 2**32,
+            seed=config["seed"],
             device=device,
             verbose=verbose,
         )
@@ -103,10 +121,10 @@ def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
 
 
 def complete(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Add what a configuration leaves to the defaults, so that it outlives a change of them.
+    """Add the defaults of algorithm and policy, so that a run outlives a change of them.
 
     :param config: checked
-    :return: the whole configuration, plain data
+    :return: the configuration, plain data
     """
     algorithm = get_algorithm(config["algo"])
     completed = dict(config)
@@ -128,35 +146,54 @@ def _defaults(cls: type, ranges: Mapping[str, Range], given: Mapping[str, Any]) 
     return defaults
 
 
-def load_model(run: str | Path, best: bool = False, device: str = "auto") -> OnPolicyAlgorithm:
+def steps_of(checkpoint: Checkpoint, name: str) -> int:
+    """Return a number of steps that a checkpoint's manifest states.
+
+    :param checkpoint: from a file, whose manifest may say anything
+    :param name: ``env_steps`` (joint) or ``agent_steps``
+    :return: 0 where it states none
+    :raises CheckpointError: if it is no number of steps
+    """
+    steps = checkpoint.manifest.get(name, 0)
+    if not isinstance(steps, int) or steps < 0:
+        raise CheckpointError(f"damaged checkpoint: {name} is {steps!r}")
+    return steps
+
+
+def load_model(
+    run: str | Path, best: bool = False, device: str = "auto", env: str | None = None
+) -> OnPolicyAlgorithm:
     """Rebuild a run's model from ``config.yml``, and load its weights.
 
-    Nothing in the folder is unpickled; but a run of a ``module:factory`` environment names code
-    that is imported and called: load such runs only if you trust them. The model has an environment
-    of one team, which was never reset.
+    No code of the folder runs: nothing is unpickled, and the ``module:factory`` of a run on an
+    environment of your own is imported and called only if ``env`` names it, too. The model has an
+    environment of one team, which was never reset.
 
     :param run: the run folder
     :param best: the weights that evaluated best, instead of the latest ones
     :param device: where the model shall be
-    :raises UsageError: if the folder is no run, or its weights are damaged or do not fit
+    :param env: the run's environment; may be left out for one that is part of this package
+    :raises UsageError: if the folder is no run, its environment is another one than ``env`` or
+        ``module:factory`` without ``env``, or its weights are damaged or do not fit
     """
     folder = Path(run)
     config = read_run_config(folder)
+    check_named(folder, config["env"], env)
     small = {**config, "n_envs": 1}
     if "batch_size" in config:
         # Of one team now; nothing is trained with it.
         small["batch_size"] = config.get("n_steps", 1)
     try:
         if best:
-            checkpoint = read_checkpoint(folder / BEST / BEST_FILE)
+            checkpoint = read_checkpoint(folder / BEST / WEIGHTS_FILE)
         else:
             _, checkpoint = CheckpointFolder(folder / CHECKPOINTS).newest()
         with warnings.catch_warnings(), th.random.fork_rng(devices=[]):
             warnings.filterwarnings("ignore", category=UserWarning, module="stable_baselines3")
             model = make_model(small, make_env(small), device)
         load_weights(model, checkpoint)
+        model.num_timesteps = steps_of(checkpoint, "agent_steps")
     except CheckpointError as error:
-        raise UsageError(str(error)) from error
-    model.num_timesteps = int(checkpoint.manifest.get("agent_steps", 0))
+        raise UsageError(f"{folder}: {error}") from error
     model.policy.set_training_mode(False)
     return model

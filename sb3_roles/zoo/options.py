@@ -17,9 +17,11 @@ if TYPE_CHECKING:
 MAX_SEED = 2**63 - 1
 # What torch, numpy and SB3 take as a seed of a whole run.
 MAX_TRAINING_SEED = 2**32 - 1
+DEVICES = ("auto", "cpu", "cuda")
 _INTEGER = re.compile(r"[+-]?[0-9]{1,100}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,5})?")
-_CONSTANTS = {"true": True, "false": False, "null": None, "none": None, "~": None}
+# Not "none": that is the name of a sub-goal.
+_CONSTANTS = {"true": True, "false": False, "null": None, "None": None, "~": None}
 
 
 class UsageError(ValueError):
@@ -148,7 +150,7 @@ def parse_value(text: str) -> Any:
     """Read the value of a ``key:value`` argument.
 
     Numbers (``5e-4`` too, which YAML 1.1 takes for text), ``true``, ``false`` and ``null`` or
-    ``none`` are what they look like; ``[...]``, ``{...}`` and quoted text are YAML; anything else
+    ``None`` are what they look like; ``[...]``, ``{...}`` and quoted text are YAML; anything else
     is text. So ``no`` and ``12:30`` stay text, which YAML would turn into False and 750.
 
     :param text: the part after the colon
@@ -159,8 +161,9 @@ def parse_value(text: str) -> Any:
         return int(text)
     if _NUMBER.fullmatch(text):
         return float(text)
-    if text.lower() in _CONSTANTS:
-        return _CONSTANTS[text.lower()]
+    for name in (text, text.lower()):
+        if name in _CONSTANTS:
+            return _CONSTANTS[name]
     if not text.startswith(("[", "{", '"', "'")):
         return text
     import yaml  # Few command lines need it at all.

@@ -84,10 +84,15 @@ class Number:
 
     def _describe(self) -> str:
         kind = "whole number" if self.whole else "number"
+        # 1e12 is clear, 4.29497e+09 is not.
+        low, high = (
+            f"{bound:.0f}" if self.whole and 1e6 < bound < 1e12 else f"{bound:g}"
+            for bound in (self.low, self.high)
+        )
         if math.isinf(self.high):
-            text = f"a finite {kind} {'above' if self.above else 'from'} {self.low:g}"
+            text = f"a finite {kind} {'above' if self.above else 'from'} {low}"
         else:
-            text = f"a {kind} in {'(' if self.above else '['}{self.low:g}, {self.high:g}]"
+            text = f"a {kind} in {'(' if self.above else '['}{low}, {high}]"
         text += ", a schedule such as lin_5.0e-4" if self.schedule else ""
         return text + (", or null" if self.optional else "")
 
@@ -112,6 +117,22 @@ class Flag:
         if isinstance(value, bool) or (value is None and self.optional):
             return None
         return f"must be true or false, got {value!r}"
+
+
+@dataclass(frozen=True)
+class Text:
+    """Any text.
+
+    :param optional: None is allowed, too
+    """
+
+    optional: bool = False
+
+    def problem(self, value: Any) -> str | None:
+        """See :class:`Range`."""
+        if isinstance(value, str) or (self.optional and value is None):
+            return None
+        return f"must be a text{' or null' if self.optional else ''}, got {value!r}"
 
 
 @dataclass(frozen=True)
@@ -175,10 +196,7 @@ class Items:
         if isinstance(value, str) or not isinstance(value, Sequence) or len(value) < self.least:
             return f"must be a list of at least {self.least}, got {value!r}"
         for entry in value:
-            if self.item is None:
-                problem = None if isinstance(entry, str) else f"must be a text, got {entry!r}"
-            else:
-                problem = self.item.problem(entry)
+            problem = (self.item or Text()).problem(entry)
             if problem is not None:
                 return f"entry {problem}"
         return None
@@ -195,6 +213,8 @@ class Options:
 
     def problem(self, value: Any) -> str | None:
         """See :class:`Range`."""
+        if not isinstance(value, Mapping):
+            return f"must be keys and values, got {value!r}"
         found = problems("", value, self.keys)
         return "; ".join(found) if found else None
 

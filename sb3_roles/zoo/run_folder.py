@@ -18,7 +18,7 @@ from sb3_roles.zoo.environments import folder_name
 from sb3_roles.zoo.options import UsageError
 
 ARGS_FILE, COMMAND_FILE, LOCK_FILE = "args.yml", "command.txt", "lock"
-CHECKPOINTS, BEST, BEST_FILE = "checkpoints", "best", "model.ckpt"
+CHECKPOINTS, BEST = "checkpoints", "best"
 _PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "numpy", "numba", "gymnasium")
 
 
@@ -30,6 +30,23 @@ def _numbered(folder: Path, env: str) -> dict[int, Path]:
         if match and path.is_dir():
             found[int(match[1])] = path
     return found
+
+
+def find_run(logs: Path, algo: str, env: str, exp_id: int = 0) -> Path:
+    """Find a run folder, ``<logs>/<algo>/<env>_<id>``.
+
+    :param logs: folder of all runs
+    :param algo: name of the algorithm
+    :param env: name of the environment
+    :param exp_id: number of the run; 0 for the latest
+    :raises UsageError: if there is none
+    """
+    runs = _numbered(logs / algo, env)
+    if runs and exp_id in (0, *runs):
+        return runs[exp_id or max(runs)]
+    wanted = f"run {exp_id}" if exp_id else "run"
+    there = f"there are {', '.join(map(str, sorted(runs)))}" if runs else "there is none"
+    raise UsageError(f"no {wanted} of {algo} on {env} in {str(logs)!r}: {there}")
 
 
 def new_run(logs: Path, algo: str, env: str) -> Path:
@@ -98,12 +115,15 @@ def write_description(
 
 
 def note_command(run: Path, command: Sequence[str]) -> None:
-    """Add a command line to ``command.txt``, with the versions that it ran with.
+    """Add a command line to ``command.txt``, with the commit and versions that it ran with.
+
+    The commit is null where the package is no file of a git work tree, as an installed one.
 
     :param run: the run folder
     :param command: the command line
     """
-    lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {_commit()}"]
+    commit = source_commit(Path(__file__)) or "null"
+    lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
     lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
     with open(run / COMMAND_FILE, "a", encoding="utf-8") as file:
         file.write("\n".join(lines) + "\n")
@@ -119,13 +139,21 @@ def _versions() -> list[str]:
     return found
 
 
-def _commit() -> str:
-    """Return the commit of the source tree, with a mark if it was changed."""
-    here = Path(__file__).resolve().parent
+def source_commit(file: Path) -> str | None:
+    """Return the commit that a source file belongs to, with a mark if its work tree was changed.
+
+    :param file: a file of the package
+    :return: None if git does not track it: the repository around a virtual environment is another
+        project's
+    """
+    # A hook of git names the repository that it runs for there.
+    hidden = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
+    variables = {key: value for key, value in os.environ.items() if key not in hidden}
 
     def git(*arguments: str) -> str:
         result = subprocess.run(
-            ["git", "-C", str(here), *arguments],
+            ["git", "-C", str(file.resolve().parent), *arguments],
+            env=variables,
             capture_output=True,
             text=True,
             timeout=10,
@@ -134,7 +162,8 @@ def _commit() -> str:
         return result.stdout.strip()
 
     try:
+        git("ls-files", "--error-unmatch", file.name)
         changed = git("status", "--porcelain", "--untracked-files=no")
         return git("rev-parse", "HEAD") + (" with changes" if changed else "")
     except (OSError, subprocess.SubprocessError):
-        return "unknown"
+        return None

@@ -5,25 +5,27 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.common.names import closest
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import (
-    VEC_ENVS,
     ConfigError,
+    load_identity,
     load_settings,
     merge,
     read_run_config,
     read_yaml,
     resolve,
 )
-from sb3_roles.zoo.environments import AREA_SEARCH
+from sb3_roles.zoo.config_checks import VEC_ENVS
+from sb3_roles.zoo.environments import AREA_SEARCH, check_named
 from sb3_roles.zoo.options import (
-    MAX_SEED,
+    DEVICES,
+    MAX_TRAINING_SEED,
     KeyValues,
-    Parser,
     UsageError,
     int_text,
     key_value,
@@ -36,7 +38,7 @@ from sb3_roles.zoo.run_folder import ARGS_FILE
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
 
-EXIT_ERROR, EXIT_DIVERGED, EXIT_INTERRUPTED = 2, 3, 130
+EXIT_ERROR, EXIT_DIVERGED = 2, 3
 _DESCRIPTION = (
     "Train an algorithm in a new run folder <logs>/<algo>/<env>_<i>, or resume a run. Steps are "
     "joint steps: one of a whole team."
@@ -72,7 +74,16 @@ _GIVEN = frozenset(
     }
 )
 # What may be given together with --resume; the rest is the run's.
-_FREE = ("resume", "n_timesteps", "device", "num_threads", "progress", "verbose", "save_freq")
+_FREE = (
+    "resume",
+    "env",
+    "n_timesteps",
+    "device",
+    "num_threads",
+    "progress",
+    "verbose",
+    "save_freq",
+)
 _STORED = ("eval_freq", "eval_episodes", "save_freq", "log_interval", "tensorboard_log")
 _STORED_RANGES: dict[str, tuple[int, int]] = {
     "eval_freq": (0, 10**12),
@@ -109,7 +120,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     add("--algo", type=one_of("algorithm", ALGORITHMS), metavar="NAME",
         help=f"one of {', '.join(ALGORITHMS)}")  # fmt: skip
-    add("--env", metavar="ID", help="environment, or module:factory of a PettingZoo ParallelEnv")
+    add("--env", metavar="ID", help="environment, or module:factory of a PettingZoo ParallelEnv, "
+        "which is imported and called")  # fmt: skip
     add("-n", "--n-timesteps", type=joint_steps, metavar="N", help="joint steps, instead of the "
         "configuration's")  # fmt: skip
     add("--scene", metavar="NAME", help="scene of the environment")
@@ -124,8 +136,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("-params", "--hyperparams", **pairs, help="keys of the configuration to change, such as "
         "gamma:0.9 'policy_kwargs:{graph: false}'")  # fmt: skip
     add("-conf", "--conf-file", type=Path, metavar="FILE", help="configuration to read instead of "
-        "zoo_configs/<algo>.yml; of a run's config.yml the hyperparameters are taken")  # fmt: skip
-    add("--seed", type=whole_number(0, MAX_SEED), metavar="S", help="seed of the run")
+        "zoo_configs/<algo>.yml; a run's config.yml stands for its --algo, --env, --seed and "
+        "--vec-env, too, where they are not given")  # fmt: skip
+    add("--seed", type=whole_number(0, MAX_TRAINING_SEED), metavar="S", help="seed of the run")
     add("--n-seeds", type=whole_number(1, 1000), metavar="K", help="runs with seeds S .. S+K-1, "
         "one after the other")  # fmt: skip
     add("--vec-env", type=one_of("backend", VEC_ENVS), metavar="NAME", help="native, supersuit or "
@@ -140,12 +153,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--log-interval", type=whole_number(1, 10**6), metavar="N", help="iterations between rows "
         "of the log")  # fmt: skip
     add("-tb", "--tensorboard-log", metavar="DIR", help="folder for TensorBoard")
-    add("--device", type=one_of("device", ("auto", "cpu", "cuda")), metavar="NAME", help="cpu, "
+    add("--device", type=one_of("device", DEVICES), metavar="NAME", help="cpu, "
         "cuda or auto")  # fmt: skip
     add("--num-threads", type=whole_number(1, 1024), metavar="T", help="threads of torch; by "
         "default torch's own choice")  # fmt: skip
     add("-P", "--progress", action="store_true", help="show a progress bar")
-    add("--resume", type=Path, metavar="RUN", help="run folder to continue bit for bit")
+    add("--resume", type=Path, metavar="RUN", help="run folder to continue bit for bit; needs "
+        "--env, too, if that is module:factory")  # fmt: skip
     add("--verbose", type=whole_number(0, 2), metavar="N", help="0 prints the outcome only")
 
 
@@ -161,31 +175,6 @@ def add_parser(subparsers: Subparsers) -> None:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``train.py``.
-
-    :param argv: arguments without the name of the program, ``sys.argv[1:]`` by default
-    :return: exit code, see :func:`run`
-    :raises SystemExit: after help and a wrong command line
-    """
-    parser = Parser(
-        prog="train.py", description=_DESCRIPTION, formatter_class=argparse.HelpFormatter
-    )
-    add_options(parser)
-    args = parser.parse_args(argv)
-    try:
-        return run(args)
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    except UsageError as error:
-        parser.error(str(error))
-    except MemoryError as error:
-        parser.error(f"out of memory: {error or 'ask for less at once'}")
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        parser.error(f"{where}{error.strerror or error}")
-
-
 def run(args: argparse.Namespace) -> int:
     """Train, once per seed.
 
@@ -199,9 +188,9 @@ def run(args: argparse.Namespace) -> int:
         if "resume" in given:
             jobs = [_resumed_job(given)]
         else:
-            first = given.get("seed", DEFAULTS["seed"])
-            count = given.get("n_seeds", DEFAULTS["n_seeds"])
-            jobs = [_new_job(given, first + k) for k in range(count)]
+            options = _options(given)
+            seeds = range(options["seed"], options["seed"] + options["n_seeds"])
+            jobs = [_new_job(given, {**options, "seed": seed}) for seed in seeds]
     except ConfigError as error:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
@@ -221,9 +210,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _new_job(given: Mapping[str, Any], seed: int) -> dict[str, Any]:
+def _options(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all options: the given ones, those of a run's ``config.yml``, and the defaults."""
+    file = given.get("conf_file")
+    if file is None:
+        return {**DEFAULTS, **given}
+    identity = load_identity(file)
+    algo = identity.get("algo")
+    if algo is not None and given.get("algo", algo) != algo:
+        raise UsageError(f"{file} is of a run of {algo}: leave --algo {given['algo']} out")
+    if "env" not in given and "env" in identity:
+        check_named(file, identity["env"], None)
+    return {**DEFAULTS, **identity, **given}
+
+
+def _new_job(given: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the plain data of a job: its configuration and its options."""
-    options = {**DEFAULTS, **given, "seed": seed}
     algo, env = options["algo"], options["env"]
     settings = load_settings(algo, env, given.get("conf_file"))
     overrides = dict(given.get("hyperparams", {}))
@@ -242,7 +244,7 @@ def _new_job(given: Mapping[str, Any], seed: int) -> dict[str, Any]:
         overrides["env_kwargs"] = env_kwargs
     if "n_timesteps" in given:
         overrides["n_timesteps"] = given["n_timesteps"]
-    config = resolve(algo, env, merge(settings, overrides), seed, options["vec_env"])
+    config = resolve(algo, env, merge(settings, overrides), options["seed"], options["vec_env"])
     return {"config": config, "options": options, "resume": None}
 
 
@@ -253,6 +255,7 @@ def _resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
         raise UsageError(f"--resume continues a run as it is: leave --{name} out")
     path = Path(given["resume"])
     config = read_run_config(path)
+    check_named(path, config["env"], given.get("env"))
     stored = read_yaml(path / ARGS_FILE)
     if not isinstance(stored, dict):
         raise ConfigError([f"{path / ARGS_FILE}: must be keys and values"])
@@ -265,12 +268,12 @@ def _resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
             raise ConfigError(
                 [f"{path / ARGS_FILE}: {name} must be from {low} to {high}, got {value!r}"]
             )
-    if options["device"] not in ("auto", "cpu", "cuda"):
-        raise ConfigError([f"{path / ARGS_FILE}: device must be auto, cpu or cuda"])
+    if options["device"] not in DEVICES:
+        message = closest("device", options["device"], DEVICES)
+        raise ConfigError([f"{path / ARGS_FILE}: {message}"])
+    folder = options["tensorboard_log"]
+    if folder is not None and not isinstance(folder, str):
+        raise ConfigError([f"{path / ARGS_FILE}: tensorboard_log must be a text, got {folder!r}"])
     if "n_timesteps" in given:
         config["n_timesteps"] = given["n_timesteps"]
     return {"config": config, "options": options, "resume": path}
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import csv
-import io
-import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -19,7 +17,8 @@ from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
-from sb3_roles.common.checkpoint import Checkpoint, CheckpointFolder
+from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+from sb3_roles.common.files import csv_bytes, write_atomically
 from sb3_roles.common.team_wrapper import find_team_env
 
 
@@ -52,15 +51,13 @@ class CsvLog(KVWriter):
         if new:
             self._rewrite()
             return
-        with open(self.path, "a", encoding="utf-8", newline="") as file:
-            file.write(_csv_text([self.rows[-1]]))
+        with open(self.path, "ab") as file:
+            file.write(csv_bytes(self.rows[-1], []))
 
     def _rewrite(self) -> None:
         width = len(self.columns)
         self.rows = [row + [""] * (width - len(row)) for row in self.rows]
-        partial = self.path.with_name(self.path.name + ".partial")
-        partial.write_text(_csv_text([self.columns, *self.rows]), encoding="utf-8")
-        os.replace(partial, self.path)
+        write_atomically(self.path, csv_bytes(self.columns, self.rows))
 
     def close(self) -> None:
         """Nothing is open."""
@@ -70,20 +67,20 @@ class CsvLog(KVWriter):
         return {"columns": self.columns, "rows": len(self.rows)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Drop what was written after :meth:`get_state`."""
+        """Drop what was written after :meth:`get_state`.
+
+        :raises CheckpointError: if the file is no log
+        """
         rows: list[list[str]] = []
         if self.path.exists():
-            with open(self.path, encoding="utf-8", newline="") as file:
-                rows = list(csv.reader(file))
+            try:
+                with open(self.path, encoding="utf-8", newline="") as file:
+                    rows = list(csv.reader(file))
+            except (UnicodeDecodeError, csv.Error) as error:
+                raise CheckpointError(f"{self.path}: damaged log: {error}") from error
         self.columns = [str(name) for name in state["columns"]]
         self.rows = [row[: len(self.columns)] for row in rows[1 : 1 + int(state["rows"])]]
         self._rewrite()
-
-
-def _csv_text(rows: Sequence[Sequence[str]]) -> str:
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
 
 
 class StopSignals:
@@ -126,10 +123,10 @@ def train(
     resume: Checkpoint | None = None,
     save_freq: int = 0,
     log_interval: int = 1,
-    progress_bar: bool = False,
     stop_at: int | None = None,
+    begin: Callable[[], object] | None = None,
 ) -> None:
-    """Train, and leave a checkpoint at the end.
+    """Train, and leave a checkpoint at the end, unless a callback has asked to stop.
 
     Checkpoints are written between iterations only: after ``train()``, before the next rollout.
 
@@ -143,15 +140,15 @@ def train(
     :param resume: continue from this
     :param save_freq: joint steps between checkpoints; 0 for the last one only
     :param log_interval: iterations between rows of the log
-    :param progress_bar: show one
     :param stop_at: joint steps after which to stop early, as after a signal
+    :param begin: called before the first step, when ``resume`` is known to fit
     :raises FloatingPointError: if the loss is not finite; nothing is saved then
     :raises CheckpointError: if ``resume`` does not fit
     """
     env: Any = model.env
     n_agents = find_team_env(env).n_agents
     total, callback = model._setup_learn(
-        n_timesteps * n_agents, CallbackList(list(callbacks)), True, "run", progress_bar
+        n_timesteps * n_agents, CallbackList(list(callbacks)), True, "run"
     )
     if resume is not None:
         snapshot.restore(model, resume)
@@ -159,6 +156,8 @@ def train(
     if resume is not None:
         snapshot.restore_stateful(stateful, resume)
         snapshot.set_rng_state(resume.state["rng"])
+    if begin is not None:
+        begin()
     per_iteration = model.n_steps * env.num_envs
     saved = model.num_timesteps
 
@@ -173,7 +172,12 @@ def train(
         checkpoints.save(env_steps, manifest=manifest, **snapshot.capture(model, stateful))
 
     limit = total if stop_at is None else min(total, stop_at * n_agents)
-    while model.num_timesteps < limit and stop.received is None:
+    # An algorithm may be finished before its time: early stopping.
+    while not (
+        model.num_timesteps >= limit
+        or stop.received is not None
+        or getattr(model, "finished", False)
+    ):
         # Returns False when a callback asks to stop, in the middle of a rollout.
         if not model.collect_rollouts(env, callback, model.rollout_buffer, model.n_steps):
             break

@@ -1,0 +1,154 @@
+"""What is wrong with a configuration: every key on its own, and keys that do not go together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sb3_roles.common.names import closest
+from sb3_roles.common.roles import ROLES, role_controls
+from sb3_roles.zoo.algorithms import ALGORITHMS, POLICY_ARGUMENTS, Algorithm
+from sb3_roles.zoo.environments import (
+    AREA_SEARCH,
+    REWARD_COMPONENTS,
+    env_problems,
+    scene_of_run,
+)
+from sb3_roles.zoo.options import MAX_TRAINING_SEED
+from sb3_roles.zoo.ranges import Choice, Items, Range, Text, Weights, Whole, problems
+
+NESTED = ("env_kwargs", "wrapper_kwargs", "policy_kwargs")
+RADIUS = "communication_radius"
+# The wrapper and the backends have these, behind numba and SB3, which take seconds to import.
+REWARD_SHARING = ("own", "same_role", "team")
+VEC_ENVS = ("auto", "native", "supersuit")
+_RUN: dict[str, Range] = {"n_timesteps": Whole(1, 1e12), "n_envs": Whole(1, 1e5)}
+# Options of the command line, which a run's configuration holds, too.
+IDENTITY: dict[str, Range] = {
+    "algo": Choice(tuple(ALGORITHMS)),
+    "env": Text(),
+    "seed": Whole(0, MAX_TRAINING_SEED),
+    "vec_env": Choice(VEC_ENVS),
+}
+
+
+def config_problems(config: Mapping[str, Any]) -> list[str]:
+    """Find all that is wrong with a whole configuration.
+
+    :param config: as :func:`~sb3_roles.zoo.config.resolve` returns it
+    :return: one line per problem
+    """
+    algo, env = config.get("algo"), config.get("env")
+    if not isinstance(algo, str) or algo not in ALGORITHMS:
+        return [closest("algorithm", algo, ALGORITHMS)]
+    algorithm = ALGORITHMS[algo]
+    if not isinstance(env, str):
+        return [f"env must be a name or module:factory, got {env!r}"]
+    top: dict[str, Range] = {
+        **_RUN,
+        "policy": Choice(tuple(algorithm.policies)),
+        **algorithm.parameters,
+    }
+    nested = {key: config[key] for key in NESTED if key in config}
+    identity = {key: config[key] for key in IDENTITY if key in config}
+    flat = {key: config[key] for key in config if key not in (*nested, *identity)}
+    found = problems("", identity, IDENTITY)
+    # The nested keys are here for the closest match of a mistyped one.
+    found += problems("", flat, {**top, **dict.fromkeys(NESTED, Weights())})
+    for key, value in nested.items():
+        if not isinstance(value, Mapping):
+            found.append(f"{key} must be keys and values, got {value!r}")
+    if isinstance(config.get("env_kwargs"), Mapping):
+        found += env_problems(env, config["env_kwargs"])
+    if isinstance(config.get("wrapper_kwargs"), Mapping):
+        found += _wrapper_problems(algorithm, env, config["wrapper_kwargs"])
+    policy = config.get("policy")
+    known = isinstance(policy, str) and policy in POLICY_ARGUMENTS
+    if known and isinstance(config.get("policy_kwargs"), Mapping):
+        found += problems("policy_kwargs", config["policy_kwargs"], POLICY_ARGUMENTS[str(policy)])
+    return found or _together(config)
+
+
+def _wrapper_problems(algorithm: Algorithm, env: str, options: Mapping[str, Any]) -> list[str]:
+    if algorithm.wrapper == "team":
+        if options:
+            return [f"wrapper_kwargs must be empty: {algorithm.name} has no roles, got {options}"]
+        return []
+    roles = options.get("roles", ["explore", "cover"])
+    names = roles if isinstance(roles, list) else ()
+    role_names = tuple(name for name in names if isinstance(name, str))
+    found = problems(
+        "wrapper_kwargs",
+        options,
+        {
+            "roles": Items(Choice(tuple(ROLES)), least=1),
+            "role_weights": Weights(optional=True),
+            "primitive_weights": Choice(("identity", "role_reward"), matrix=True),
+            "reward_sharing": Choice(REWARD_SHARING),
+            "role_every": Whole(1, 1e6),
+            "role_control": Choice(role_controls(role_names)),
+        },
+    )
+    if not algorithm.holds_roles and not found:
+        for key, only in (("role_every", 1), ("role_control", "learned")):
+            if options.get(key, only) != only:
+                found.append(
+                    f"wrapper_kwargs.{key} must be {only} for {algorithm.name}, whose policy "
+                    f"chooses a role at every step, got {options[key]!r}"
+                )
+    if env == AREA_SEARCH and not found:
+        found += _component_problems(options)
+    return found
+
+
+def _component_problems(options: Mapping[str, Any]) -> list[str]:
+    tables = {"role_weights": options.get("role_weights") or {}}
+    matrix = options.get("primitive_weights")
+    if isinstance(matrix, Mapping):
+        tables |= {f"primitive_weights.{role}": weights for role, weights in matrix.items()}
+    return [
+        f"wrapper_kwargs.{table}: {closest('reward component', name, REWARD_COMPONENTS)}"
+        for table, weights in tables.items()
+        for name in weights
+        if name not in REWARD_COMPONENTS
+    ]
+
+
+def links_robots(config: Mapping[str, Any]) -> bool:
+    """Whether the policy has a graph of the robots that can communicate in area search."""
+    return config["env"] == AREA_SEARCH and RADIUS in POLICY_ARGUMENTS[config["policy"]]
+
+
+def _together(config: Mapping[str, Any]) -> list[str]:
+    """What is wrong with values that are right one by one."""
+    found: list[str] = []
+    n_steps, batch_size = config.get("n_steps"), config.get("batch_size")
+    if n_steps and batch_size and batch_size > n_steps * config["n_envs"]:
+        found.append(
+            f"batch_size must be at most n_steps x n_envs = {n_steps} x {config['n_envs']} = "
+            f"{n_steps * config['n_envs']} joint steps, got {batch_size}"
+        )
+    if config["env"] != AREA_SEARCH:
+        return found
+    env_kwargs, policy_kwargs = config["env_kwargs"], config["policy_kwargs"]
+    if links_robots(config) and RADIUS in policy_kwargs:
+        given, radius = policy_kwargs[RADIUS], scene_of_run(config).communication_radius
+        if given != radius:
+            found.append(
+                f"policy_kwargs.{RADIUS} must be the environment's, {radius:g}, got {given}: "
+                f"leave it out, and give env_kwargs.{RADIUS}"
+            )
+    if ALGORITHMS[config["algo"]].wrapper == "role":
+        if env_kwargs.get("reward_sharing", "own") != "own":
+            # Robots would be paid twice for their team mates, once by each of the two.
+            found.append(
+                f"env_kwargs.reward_sharing must be own for {config['algo']}, got "
+                f"{env_kwargs['reward_sharing']}: with roles, wrapper_kwargs.reward_sharing shares"
+            )
+        found += [
+            f"env_kwargs.{key} weighs nothing for {config['algo']}: with roles, "
+            "wrapper_kwargs.role_weights do"
+            for key in ("alpha", "beta")
+            if key in env_kwargs
+        ]
+    return found
