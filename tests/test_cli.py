@@ -325,6 +325,8 @@ def test_interrupt_ends_quietly():
     process = subprocess.Popen(
         [*COMMAND, "simulate", "--episodes", "400000"],
         env=ENVIRONMENT,
+        # Jobs that a script starts in the background ignore the signal, and so would their children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
