@@ -41,6 +41,7 @@ def test_every_case_does_the_same_counted_work(capsys):
     [
         (["--algo", "hmapo"], "did you mean 'hmappo'?"),
         (["--algo", "hmappo,"], "''"),
+        (["--algo", "gnn"], "allowed are hmappo, mappo, ecc, h2gnn"),
         (["--vec-env", "nativ"], "did you mean 'native'?"),
         (["--repeats", "0"], "from 1"),
         (["--scene", "hart"], "did you mean 'hard'?"),

@@ -21,7 +21,8 @@ from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback, TeamPr
 from sb3_roles.common.checkpoint import read_checkpoint
 from sb3_roles.common.row_policies import MaskedRowPolicy, MaskWrapper
 from sb3_roles.evaluation.callback import EvaluationCallback
-from sb3_roles.evaluation.evaluators import VecEnvEvaluator
+from sb3_roles.evaluation.episodes import held_out_seed, selection_seed
+from sb3_roles.evaluation.evaluators import VecEnvEvaluator, area_scene, make_evaluator
 
 SMALL = {
     "local_channels": [4] * 3,
@@ -222,6 +223,36 @@ def test_evaluation_counts_joint_steps_and_keeps_the_best(tmp_path):
     with open(tmp_path / "evaluations.csv") as file:
         rows = list(csv.DictReader(file))
     assert [row["agent_steps"] for row in rows] == ["120", "240", "360", "480", "600"]
+
+
+def test_the_best_policy_is_selected_on_episodes_of_its_own():
+    callback = EvaluationCallback(16, n_episodes=2, seed=7)
+    model = make_model()
+    model.learn(HORIZON * N_TEAMS * 3, callback=callback)
+    assert callback.evaluate.stream_seed == selection_seed(7)
+    assert make_evaluator(model, 2, 7).stream_seed == held_out_seed(7)
+    assert area_scene(model.env) == callback.evaluate.scene
+    assert area_scene(TeamWrapper(make_team_vec_env(PlainEnv, 1, 0))) is None
+
+
+def test_other_environments_are_evaluated_on_other_streams_than_they_select_on():
+    class Watcher:
+        """Does nothing, and keeps what it sees first."""
+
+        policy, first = None, None
+
+        def predict(self, observations, *_):
+            self.first = observations["observation"] if self.first is None else self.first
+            return np.zeros(len(observations["observation"]), int), None
+
+    seen = []
+    for stream in ("held_out", "selection", "selection"):
+        watcher = Watcher()
+        env = TeamWrapper(make_team_vec_env(PlainEnv, 2))
+        VecEnvEvaluator(env, 2, seed=3, stream=stream)(watcher)
+        seen.append(watcher.first)
+    assert np.array_equal(seen[1], seen[2])
+    assert not np.any(seen[0] == seen[1])
 
 
 def test_other_environments_are_evaluated_by_their_return():

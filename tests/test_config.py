@@ -12,7 +12,7 @@ import pytest
 import toy_envs
 import yaml
 
-from area_search.paths import SUB_GOALS
+from area_search.paths import GOAL_SETS, SUB_GOALS
 from area_search.rewards import REWARD_COMPONENTS
 from area_search.scenes import SCENES, Scene, get_scene
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError
@@ -69,6 +69,7 @@ def test_tables_are_the_signatures(algorithm):
 
 def test_names_are_those_of_the_code():
     assert SUB_GOALS == environments.SUB_GOALS
+    assert GOAL_SETS == environments.GOAL_SETS
     assert REWARD_COMPONENTS == environments.REWARD_COMPONENTS
     assert REWARD_SHARING == config_checks.REWARD_SHARING
     assert BACKENDS == config_checks.VEC_ENVS
@@ -155,6 +156,14 @@ FILES_BY_NAME = {path.stem: path for path in FILES}
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
+        (
+            {
+                "wrapper_kwargs": {"roles": ["cover", "explore"]},
+                "policy_kwargs": {"goal_key": "sub_goal"},
+            },
+            "goal_key: the rows of sub_goal are for frontier and target, but the roles cover, "
+            "explore head for target, frontier",
+        ),
         ({"gama": 0.9}, "unknown key 'gama'.*did you mean 'gamma'"),
         ({"env_kwarg": {}}, "did you mean 'env_kwargs'"),
         ({"gamma": 1.5}, r"gamma must be a number in \[0, 1\], got 1.5"),

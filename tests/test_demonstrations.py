@@ -1,5 +1,7 @@
 """Recording of demonstrations: what is stored is what the teams saw and did."""
 
+import dataclasses
+import io
 import json
 import zipfile
 
@@ -10,15 +12,15 @@ from helpers import hand_made, one_line
 from torch.utils.data import DataLoader
 
 from area_search import BatchedAreaSearch, get_scene
+from area_search.kernels import METRICS
 from sb3_roles.baselines import controller_class
 from sb3_roles.gnn import recording
 from sb3_roles.gnn.demonstrations import (
-    METRICS,
     DemonstrationError,
-    JointSteps,
     load_demonstrations,
     pack_maps,
 )
+from sb3_roles.gnn.joint_steps import JointSteps
 from sb3_roles.gnn.recording import record
 from sb3_roles.zoo import demonstrate
 from sb3_roles.zoo.options import Parser, UsageError
@@ -126,6 +128,30 @@ def facts(path, **changes):
     return np.frombuffer(json.dumps(values).encode(), np.uint8)
 
 
+def of_scene(path, **changes):
+    return facts(path, scene={**load_demonstrations(path).facts["scene"], **changes})
+
+
+def members(path):
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def repack(path, compression, **changes):
+    content = {**members(path), **changes}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+
+
+def promise(path, count):
+    """Let the head of an array declare more than there is."""
+    head = io.BytesIO()
+    declared = {"descr": "<i8", "fortran_order": False, "shape": (count,)}
+    np.lib.format.write_array_header_1_0(head, declared)
+    repack(path, zipfile.ZIP_DEFLATED, **{"episodes.npy": head.getvalue() + bytes(16)})
+
+
 DAMAGES = {
     "no file": lambda path: path.unlink(),
     "no archive": lambda path: path.write_bytes(b"nothing of the kind"),
@@ -140,6 +166,13 @@ DAMAGES = {
     "another format": lambda path: rewrite(path, facts=facts(path, format="x")),
     "a later version": lambda path: rewrite(path, facts=facts(path, format_version=9)),
     "no scene": lambda path: rewrite(path, facts=facts(path, scene=None)),
+    "an endless scene": lambda path: rewrite(path, facts=of_scene(path, height=float("inf"))),
+    "a scene of no height": lambda path: rewrite(path, facts=of_scene(path, height=0)),
+    "a side that is no whole number": lambda path: rewrite(path, facts=of_scene(path, width=9.0)),
+    "no controller": lambda path: rewrite(path, facts=facts(path, controller=None)),
+    "lines in a name": lambda path: rewrite(path, facts=facts(path, controller="a\nb")),
+    "a header that promises too much": lambda path: promise(path, 10**13),
+    "another packing": lambda path: repack(path, zipfile.ZIP_LZMA),
     "no text": lambda path: rewrite(path, facts=np.array([255, 254], np.uint8)),
 }
 
@@ -171,6 +204,27 @@ def test_bytes_that_flip_are_noticed(tmp_path):
         else:
             # Only what carries no meaning, such as the date of a member, may differ.
             assert same(found, good)
+
+
+def test_the_digest_is_that_of_the_content(tmp_path):
+    path = tmp_path / "d.npz"
+    found = record("random", SCENE, 3, seed=1, path=path)
+    digest = found.digest()
+    assert len(digest) == 64
+    assert load_demonstrations(path).digest() == digest
+    # Neither the packing nor the version that recorded matters.
+    repack(path, zipfile.ZIP_STORED)
+    rewrite(path, facts=facts(path, version="0.0"))
+    assert load_demonstrations(path).digest() == digest
+    assert record("random", SCENE, 5, seed=1).first(3).digest() == digest
+    others = [
+        found.first(2),
+        record("random", SCENE, 3, seed=2),
+        record("greedy", SCENE, 3, seed=1),
+        dataclasses.replace(found, actions=np.zeros_like(found.actions)),
+        dataclasses.replace(found, facts={**found.facts, "controller": "greedy"}),
+    ]
+    assert len({digest, *(other.digest() for other in others)}) == 6
 
 
 def test_more_episodes_than_there_are_can_not_be_had():
@@ -210,6 +264,16 @@ def test_the_data_set_serves_a_loader():
     assert counted.tolist() == np.bincount(found.actions[[4, 1]].reshape(-1), minlength=5).tolist()
 
 
+@pytest.fixture
+def without_ortools(monkeypatch):
+    """As if OR-Tools were not installed."""
+
+    def missing(name):
+        raise ImportError(f"no module {name}")
+
+    monkeypatch.setattr("sb3_roles.baselines.ortools_routing.import_module", missing)
+
+
 def command(*arguments):
     """Run ``sb3-roles demonstrate``."""
     parser = Parser()
@@ -235,3 +299,12 @@ def test_the_command_records_and_goes_on(tmp_path, capsys):
         command(*options, "--episodes", "2", "--seed", "5")
     assert "argument --out" in one_line(caught.value)
     assert "seed is 4 there, 5 here" in str(caught.value)
+
+
+def test_a_controller_that_is_not_installed_gives_one_line(tmp_path, without_ortools):
+    path = tmp_path / "d.npz"
+    with pytest.raises(UsageError) as caught:
+        command("--controller", "vrpc", "--episodes", "2", "--out", str(path))
+    assert one_line(caught.value).startswith("argument --controller: ")
+    assert "sb3_roles[vrp]" in str(caught.value)
+    assert not path.exists()

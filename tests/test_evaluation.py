@@ -14,7 +14,15 @@ from sb3_roles import HMAPPO, MAPPO, RoleWrapper, TeamWrapper, make_team_vec_env
 from sb3_roles.baselines import CONTROLLER_NAMES, CONTROLLERS, controller_class
 from sb3_roles.baselines.random import RandomController
 from sb3_roles.common.team_vec_env import team_seeds
-from sb3_roles.evaluation.episodes import Player, describe, held_out_seed, run_episodes
+from sb3_roles.evaluation.episodes import (
+    STREAMS,
+    Player,
+    describe,
+    held_out_seed,
+    run_episodes,
+    selection_seed,
+    stream_of,
+)
 from sb3_roles.evaluation.evaluators import SceneEvaluator
 from sb3_roles.evaluation.intervals import estimate_mean, t_quantile, t_within
 from sb3_roles.evaluation.metrics import (
@@ -26,6 +34,9 @@ from sb3_roles.evaluation.metrics import (
 )
 from sb3_roles.evaluation.policies import PolicyController
 from sb3_roles.evaluation.records import TIMINGS, EpisodeRecords
+from sb3_roles.zoo.cli import main
+from sb3_roles.zoo.options import MAX_SEED
+from sb3_roles.zoo.summaries import comparison_of, report_of, table_of
 
 PLAIN = get_scene("hard", horizon=12)
 STOPPING = get_scene("hard", horizon=40, early_stop_patience=6)
@@ -39,7 +50,8 @@ def assert_same(first: EpisodeRecords, second: EpisodeRecords) -> None:
         one, other = getattr(first, field.name), getattr(second, field.name)
         if isinstance(one, np.ndarray):
             assert one.dtype == other.dtype, field.name
-            assert np.array_equal(one, other), field.name
+            # Bounds that are not known are NaN.
+            assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), field.name
         elif field.name == "counts":
             assert one.keys() == other.keys()
             assert all(np.array_equal(one[name], other[name]) for name in one)
@@ -381,6 +393,7 @@ def recorded(seen, covered, **changes) -> EpisodeRecords:
         "roles": np.full((n, horizon, 2), -1, np.int8),
         "decision_seconds": np.ones((n, horizon), np.float32),
         "timing": {"seconds": 1.0, "batch_size": n},
+        "bounds": np.full(n, np.nan),
     }
     return EpisodeRecords(**{**values, **changes})
 
@@ -471,10 +484,11 @@ SMALL = {
 TINY = get_scene("hard", height=9, width=9, n_targets=10, horizon=8, n_agents=3)
 
 
-def tiny_policy(sub_goal="assigned", algo=HMAPPO, scene=TINY, **wrapper):
+def tiny_policy(sub_goal="assigned", algo=HMAPPO, scene=TINY, graph=True, **wrapper):
     """An untrained policy, with outputs large enough to tell one observation from another."""
     venv = make_team_vec_env(lambda: AreaSearchEnv(scene, sub_goal=sub_goal), 2, seed=0)
-    options = {"policy_kwargs": SMALL, "n_steps": 2, "batch_size": 4, "device": "cpu", "seed": 1}
+    options = {"n_steps": 2, "batch_size": 4, "device": "cpu", "seed": 1}
+    options["policy_kwargs"] = {**SMALL, "graph": graph}
     if algo is MAPPO:
         return MAPPO("TeamPolicy", TeamWrapper(venv), **options)
     model = HMAPPO("RolePolicy", RoleWrapper(venv, **wrapper), **options)
@@ -596,3 +610,79 @@ def test_held_out_episodes_are_scored_as_the_records_say():
     assert scores["n_episodes"] == 25
     # No training team has such a seed.
     assert max(team_seeds(0, 1000)) < 2**32 == held_out_seed(0)
+
+
+def test_a_policy_is_selected_on_episodes_that_no_seed_of_the_commands_plays():
+    model = tiny_policy()
+    scores = SceneEvaluator(TINY, 25, seed=2, stream="selection")(model)
+    records = run_episodes(PolicyController(model), TINY, 25, selection_seed(2))
+    assert scores["cover"] == pytest.approx(summarize(records)["cover"]["mean"] / 100)
+    assert held_out_seed(MAX_SEED) < selection_seed(0) < 2**64
+    for kind, make in STREAMS.items():
+        assert stream_of(make(5)) == (kind, 5)
+    assert stream_of(5) == ("raw", 5)
+    with pytest.raises(ValueError, match="did you mean 'selection'"):
+        SceneEvaluator(TINY, 25, stream="selektion")
+
+
+class Knowing(RandomController):
+    """Says of even episodes that no team covers more than their number."""
+
+    def begin(self, batch):
+        super().begin(batch)
+        self.bounds = np.where(batch.episodes % 2 == 0, batch.episodes.astype(float), np.nan)
+
+
+def test_bounds_that_a_controller_knows_are_kept_and_summarized():
+    records = run_episodes(Knowing(), PLAIN, 9, seed=0, first_episode=10, batch_size=4)
+    known = np.array([10.0, 12.0, 14.0, 16.0, 18.0])
+    assert records.bounds[::2].tolist() == known.tolist()
+    assert np.isnan(records.bounds[1::2]).all()
+    bound = summarize(records)["cover_bound"]
+    assert bound["mean"] == pytest.approx(known.mean())  # Of 100 targets.
+    assert bound["se"] == pytest.approx(known.std(ddof=1) / np.sqrt(5))
+    assert bound["ci95"][0] < bound["mean"] < bound["ci95"][1] and bound["unit"] == "%"
+    blind = run_episodes(RandomController(), PLAIN, 9, seed=0, first_episode=10)
+    assert "cover_bound" not in summarize(blind)
+    for one, other in ((records, blind), (blind, records), (records, records)):
+        assert "cover_bound" not in paired_differences(one, other)
+    reports = [report_of(each) for each in (blind, records)]
+    assert "cover_bound  " in table_of(reports[1]) and "cover_bound" not in table_of(reports[0])
+    lines = comparison_of(
+        reports,
+        [
+            {
+                "controller": "Knowing",
+                "against": "RandomController",
+                "metrics": paired_differences(records, blind),
+            }
+        ],
+    ).split("\n")
+    heads = [k for k, line in enumerate(lines) if "path_length" in line]
+    assert "cover_bound, %" in lines[heads[0]] and "cover_bound" not in lines[heads[1]]
+    assert "14.00 [" in lines[heads[0] + 2] and "  -  " in lines[heads[0] + 1]
+
+
+@pytest.mark.parametrize("graph", [True, False])
+def test_a_policy_without_messages_has_none_to_switch_off(graph):
+    model = tiny_policy(graph=graph)
+    assert PolicyController(model).communicate is (True if graph else None)
+    assert describe(PolicyController(model), TINY)["communication"] is (True if graph else None)
+    if graph:
+        assert PolicyController(model, communicate=False).communicate is False
+    else:
+        with pytest.raises(ValueError, match="no messages that could be switched off"):
+            PolicyController(model, communicate=False)
+
+
+@pytest.mark.parametrize("option", ["--stochastic", "--no-communication", "--load-best"])
+def test_options_of_policies_are_refused_for_scripted_controllers(option, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["evaluate", "--controller", "random,greedy", "--episodes", "2", option])
+    assert end.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.splitlines()[-1] == (
+        f"sb3-roles evaluate: error: argument {option}: only policies of runs heed it, and only "
+        "scripted controllers are named"
+    )

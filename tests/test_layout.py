@@ -17,15 +17,22 @@ FORBIDDEN = {
         "area_search",
         "sb3_roles.mappo",
         "sb3_roles.hmappo",
+        "sb3_roles.gnn",
         "sb3_roles.baselines",
         "sb3_roles.evaluation",
         "sb3_roles.zoo",
     ),
-    "sb3_roles/mappo": ("area_search", "sb3_roles.hmappo", "sb3_roles.evaluation", "sb3_roles.zoo"),
-    "sb3_roles/hmappo": ("area_search", "sb3_roles.evaluation", "sb3_roles.zoo"),
+    "sb3_roles/mappo": (
+        "area_search",
+        "sb3_roles.hmappo",
+        "sb3_roles.gnn",
+        "sb3_roles.evaluation",
+        "sb3_roles.zoo",
+    ),
+    "sb3_roles/hmappo": ("area_search", "sb3_roles.gnn", "sb3_roles.evaluation", "sb3_roles.zoo"),
     "sb3_roles/gnn": ("sb3_roles.hmappo", "sb3_roles.evaluation", "sb3_roles.zoo"),
-    "sb3_roles/baselines": ("sb3_roles.zoo",),
-    "sb3_roles/evaluation": ("sb3_roles.zoo",),
+    "sb3_roles/baselines": ("sb3_roles.gnn", "sb3_roles.zoo"),
+    "sb3_roles/evaluation": ("sb3_roles.gnn", "sb3_roles.zoo"),
 }
 
 

@@ -18,6 +18,14 @@ from sb3_roles.evaluation.records import EpisodeRecords, RecordsError, read_reco
 STOPPING = get_scene("hard", horizon=40, early_stop_patience=6, n_agents=3)
 
 
+class Bounded(RandomController):
+    """Random, and knows a bound in most episodes."""
+
+    def begin(self, batch):
+        super().begin(batch)
+        self.bounds = np.where(batch.episodes % 10 == 3, np.nan, 20.0 + batch.episodes)
+
+
 class WithRoles(RandomController):
     """Random, in roles that follow the clock."""
 
@@ -54,7 +62,7 @@ def assert_identical(first: EpisodeRecords, second: EpisodeRecords) -> None:
             assert array.tobytes() == twin.tobytes(), (field.name, name)
 
 
-@pytest.mark.parametrize("controller", [WithRoles(), RandomController()], ids=["roles", "none"])
+@pytest.mark.parametrize("controller", [WithRoles(), RandomController(), Bounded()])
 @pytest.mark.parametrize("scene", [STOPPING, get_scene("easy", horizon=5, n_agents=1)])
 def test_records_come_back_as_they_were(controller, scene, tmp_path):
     records = run_episodes(controller, scene, 12, 2**64 - 1, first_episode=3, batch_size=5)
@@ -65,6 +73,11 @@ def test_records_come_back_as_they_were(controller, scene, tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["x.parquet"]
     has_roles = isinstance(controller, WithRoles)
     assert (back.roles.max() >= 0) == has_roles
+    known = isinstance(controller, Bounded)
+    expected = np.arange(23.0, 35.0) if known else np.full(12, np.nan)
+    expected[[0, 10]] = np.nan
+    np.testing.assert_array_equal(back.bounds, expected)
+    assert ("cover_bound" in summarize(back)) == known
 
 
 def test_long_horizons_have_wider_distances(tmp_path):
@@ -192,6 +205,8 @@ def test_tables_that_are_no_episodes_are_refused(recorded, tmp_path):
     assert newer == "records of format version 2, this program reads 1"
     assert "not one of episode records" in rewritten(same, format="something else")
     assert "damaged records" in rewritten(same, metadata={})
+    early = rewritten(lambda whole: whole.slice(0, 2))
+    assert early == "damaged records: an episode of 2 steps ended before its scene can end it"
     assert "count up from 0" in rewritten(lambda whole: whole.take([0, 2, 3]))
     assert "begin at 0" in rewritten(lambda whole: whole.slice(1))
     assert "damaged records" in rewritten(lambda whole: whole.slice(0, 0))
@@ -202,3 +217,60 @@ def test_tables_that_are_no_episodes_are_refused(recorded, tmp_path):
         return whole.set_column(k, "seen", whole["seen"].cast("int64"))
 
     assert "column seen is int64, not int32" in rewritten(wide)
+
+
+def without(entries, key):
+    return {name: value for name, value in entries.items() if name != key}
+
+
+METADATA_KEYS = (
+    *("name", "controller", "controller_options", "scene", "deterministic", "communication"),
+    *("version", "config_hash", "seed", "role_names", "versions"),
+)
+
+
+def test_metadata_that_nobody_could_have_written_are_refused(recorded, tmp_path):
+    import pyarrow.parquet as pq
+
+    path = tmp_path / "x.parquet"
+    write_records(recorded, path)
+    table = pq.read_table(path)
+    header = json.loads(table.schema.metadata[b"sb3_roles"])
+    about, timing, scene = header["metadata"], header["timing"], header["metadata"]["scene"]
+    assert sorted(about) == sorted(METADATA_KEYS)
+
+    def rewritten(metadata=about, timing=timing) -> str:
+        # With the hash that belongs to them.
+        digest = module._digest(metadata, timing)
+        text = json.dumps({**header, "metadata": metadata, "timing": timing, "sha256": digest})
+        pq.write_table(table.replace_schema_metadata({b"sb3_roles": text}), path)
+        return refusal(path).removeprefix("damaged records: ")
+
+    for key in about:
+        assert rewritten(without(about, key)) == f"the entry '{key}' of the metadata is missing"
+        assert rewritten({**about, key: 0.5}) == f"the entry '{key}' of the metadata is 0.5"
+    for key in timing:
+        wrong = rewritten(timing=without(timing, key))
+        assert wrong == f"the entry '{key}' of the metadata is missing"
+        for value in (None, 0, True, -1.0):
+            assert f"the entry '{key}'" in rewritten(timing={**timing, key: value})
+    for key, value in (
+        ("seed", -1),
+        ("seed", 2**64),
+        ("seed", True),
+        ("role_names", [1]),
+        ("versions", {"python": 3}),
+    ):
+        assert f"the entry '{key}'" in rewritten({**about, key: value})
+    assert "NaN" in rewritten({**about, "controller_options": {"x": float("nan")}})
+    assert "'horizon'" in rewritten({**about, "scene": without(scene, "horizon")})
+    assert "'depth'" in rewritten({**about, "scene": {**scene, "depth": 1}})
+    # No memory is asked for that the rows do not account for.
+    for change, message in (
+        ({"horizon": 10**15}, "horizon must be a whole number from 1 to 1000000"),
+        ({"horizon": 10**6, "early_stop_patience": None}, "before its scene can end it"),
+        ({"n_agents": 10**9}, "n_agents must be"),
+        ({"n_agents": 4}, "distance_3"),
+        ({"n_targets": 3}, "column n_targets is not the scene's 3"),
+    ):
+        assert message in rewritten({**about, "scene": {**scene, **change}})

@@ -272,6 +272,49 @@ def test_seeding_the_environment_repeats_its_random_roles():
     np.testing.assert_array_equal(first, random_roles(env, 6)[0])
 
 
+def at_the_end(env, n_steps):
+    """Play in the roles that are given; yield row, clock, its role before, its last observation."""
+    observations, clock = env.reset(), np.zeros(env.num_envs, int)
+    for _ in range(n_steps):
+        roles = observations["role"].argmax(axis=1)
+        observations, _, dones, infos = env.step(np.stack([roles, roles], axis=1))
+        clock += 1
+        for row in np.flatnonzero(dones):
+            last = infos[row]["terminal_observation"]
+            assert last["role"].sum() == 1 and last["role_due"] == [0]
+            yield row, clock[row], roles[row], last
+        clock[dones] = 0
+
+
+@pytest.mark.parametrize("role_every", [1, 3])
+@pytest.mark.parametrize("sub_goal", ["nearest", "assigned"])
+def test_the_last_observation_has_the_role_that_the_rule_would_give_next(sub_goal, role_every):
+    options = {"role_control": "nearest", "role_every": role_every}
+    env = small_search(sub_goal=sub_goal, roles=options, early_stop_patience=3)
+    rule = NearestRole(env.roles, env.team_env.goal_nearness)
+    decided, changed = 0, 0
+    for _, clock, before, last in at_the_end(env, 60):
+        expected = before
+        if clock % role_every == 0:
+            expected = rule({"sub_goal": last["sub_goal"][None]})[0]
+            decided += 1
+            changed += expected != before
+        assert last["role"].argmax() == expected
+    assert decided > changed > 0
+
+
+@pytest.mark.parametrize("role_every", [1, 5, 6])
+def test_the_last_observation_has_the_random_role_of_the_coming_step(role_every):
+    options = {"role_control": "random", "role_every": role_every}
+    ends = list(at_the_end(small_search(roles=options, horizon=10, n_teams=8), 10))
+    assert len(ends) == 24
+    # Where the episode goes on, that step is played.
+    longer = random_roles(small_search(roles=options, horizon=11, n_teams=8), 11)[0]
+    assert [last["role"].argmax() for *_, last in ends] == longer[10].tolist()
+    changed = sum(last["role"].argmax() != before for _, _, before, last in ends)
+    assert (changed > 0) == (role_every != 6)
+
+
 @pytest.mark.parametrize("backend", ["native", "supersuit"])
 @pytest.mark.parametrize("expand", [True, False])
 def test_last_observations_have_the_keys_of_all_others(backend, expand):

@@ -342,6 +342,19 @@ def test_lock(tmp_path):
     RunLock(tmp_path).release()
 
 
+def test_a_link_in_the_place_of_the_lock_is_not_followed(tmp_path, monkeypatch):
+    precious = tmp_path / "precious"
+    precious.write_text("data\n")
+    (tmp_path / "lock").symlink_to(precious)
+    with pytest.raises(UsageError, match="lock: is a symbolic link"):
+        RunLock(tmp_path)
+    # Nor one that appears between the look and the opening.
+    monkeypatch.setattr("pathlib.Path.is_symlink", lambda path: False)
+    with pytest.raises(UsageError, match="lock: Too many levels of symbolic links"):
+        RunLock(tmp_path)
+    assert precious.read_text() == "data\n"
+
+
 def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + 100
     while not path.exists():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import json
 from importlib.util import find_spec
 
 import numpy as np
@@ -331,6 +332,12 @@ def test_the_plan_of_the_oracle_is_carried_out_and_bounded():
     covered = play(controller, batch)
     assert controller.n_plans == 1
     assert controller.planned[0] <= covered <= controller.bounds[0] <= 4 * 50
+    # In records each episode keeps its own.
+    records = run_episodes(OracleController(rounds=50), SMALL, 5, seed=3, batch_size=2)
+    alone = run_episodes(OracleController(rounds=50), SMALL, 2, seed=3, first_episode=3)
+    assert np.array_equal(records.bounds[3:], alone.bounds)
+    assert np.all(records.counts["covered"][:, -1] <= records.bounds)
+    assert len(set(records.bounds)) > 1
     # Targets that are seen, not covered, count for the other metric.
     seen = outcome(OracleController(rounds=1000, cell_prize=0), SMALL)["explo_paper"][:, -1]
     more = outcome(OracleController(rounds=1000, cell_prize=1000), SMALL)["explo_paper"][:, -1]
@@ -381,6 +388,7 @@ def test_a_missing_ortools_is_one_clear_line(monkeypatch):
 def test_options_are_checked_and_described(kind, options, message):
     with pytest.raises(ValueError, match=message):
         kind(**options)
-    described = kind(rounds=7).description
+    described = kind(rounds=np.int64(7)).description
+    assert json.loads(json.dumps(described)) == described
     assert described["rounds"] == 7
     assert kind(rounds=8).description != described

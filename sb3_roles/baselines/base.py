@@ -19,7 +19,9 @@ class Controller(Protocol):
     Optional attributes: ``sub_goal`` (path features that the batch shall observe), ``roles`` (int8
     (n_teams, n_agents), those of the last step) and ``role_names``, ``name`` (a label),
     ``description`` (a dict of JSON values that tells it from others of its class),
-    ``deterministic`` and ``communicate`` (where it has such a choice). Records keep the last five.
+    ``deterministic`` and ``communicate`` (where it has such a choice; None: it has none), and
+    ``bounds`` (float (n_teams,), numbers of targets that nobody can exceed in the episodes of the
+    current batch, known after their last step; NaN: not known). Records keep all but the first two.
     """
 
     def begin(self, batch: BatchedAreaSearch) -> None:

@@ -3,7 +3,7 @@
 This is no method but a bound, ours and not the paper's: a team that knows the whole map and walks
 the best routes cannot be beaten on average by one that has to search. The plan is heuristic, so
 what it covers is a *lower* bound of what full knowledge is worth; :func:`most_nodes` gives a cheap
-upper bound, and the two enclose the truth.
+upper bound, ``cover_bound`` in reports, and the two enclose the truth.
 """
 
 from __future__ import annotations
@@ -25,9 +25,13 @@ if TYPE_CHECKING:
 class OracleController(RouteController):
     """Plans once, on the true map with all its targets, and follows the plan to its end.
 
-    A target that lies on the way of a team mate is skipped. After an episode's first step
-    ``planned`` (n_teams,) has the number of targets on the routes, and ``bounds`` (n_teams,) one
-    that no plan exceeds.
+    With ``cell_prize=0`` a target that a team mate covered on its way is skipped. With cells in the
+    plan every stop is visited, whether it is a target that is covered already or not: what is seen
+    from there was planned for.
+
+    After an episode's first step ``planned``, int64 (n_teams,), is the number of targets on the
+    routes of each team, and ``bounds``, float64 (n_teams,), a number of targets that no plan
+    exceeds; both are those of the current batch. Records keep the bounds.
 
     :param rounds: see :class:`~sb3_roles.baselines.route_controller.RouteController`
     :param solutions: see there
@@ -52,8 +56,8 @@ class OracleController(RouteController):
         cell_prize: int = 0,
     ) -> None:
         super().__init__(rounds, solutions, seconds, cold)
-        self._whole("target_prize", target_prize, 1)
-        self._whole("cell_prize", cell_prize, 0)
+        self._whole(1, target_prize=target_prize)
+        self._whole(0, cell_prize=cell_prize)
         self.target_prize, self.cell_prize = target_prize, cell_prize
 
     def begin(self, batch: BatchedAreaSearch) -> None:
@@ -64,7 +68,7 @@ class OracleController(RouteController):
         super().begin(batch)
         self._revealed = np.zeros(batch.cells[0].size, np.uint8)
         self.planned = np.zeros(batch.n_teams, np.int64)
-        self.bounds = np.zeros(batch.n_teams, np.int64)
+        self.bounds = np.full(batch.n_teams, np.nan)
 
     def _known(self, batch: BatchedAreaSearch, team: int) -> np.ndarray:
         reveal(batch.cells[team].reshape(-1), self._revealed)

@@ -13,6 +13,7 @@ from sb3_roles.baselines.base import ScriptedController
 from sb3_roles.baselines.ortools_routing import improve_routes, load_ortools
 from sb3_roles.baselines.road_map import first_moves
 from sb3_roles.baselines.routing import Routes, RoutingProblem, plan_routes
+from sb3_roles.common.checks import check_whole
 
 if TYPE_CHECKING:
     from area_search.batch import BatchedAreaSearch
@@ -39,18 +40,17 @@ class RouteController(ScriptedController):
 
     def __init__(self, rounds: int, solutions: int, seconds: float, cold: bool) -> None:
         self.description: dict[str, Any] = {}
-        self._whole("rounds", rounds, 0)
-        self._whole("solutions", solutions, 0)
+        self._whole(0, rounds=rounds, solutions=solutions)
         self._number("seconds", seconds)
         self.description["cold"] = self.cold = bool(cold)
         self.rounds, self.solutions, self.seconds = rounds, solutions, seconds
         if solutions:
             load_ortools(f"the controller {self.name}")
 
-    def _whole(self, option: str, value: int, low: int) -> None:
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise ValueError(f"{option} must be a whole number of at least {low}, got {value!r}")
-        self.description[option] = value
+    def _whole(self, low: int, **options: int) -> None:
+        check_whole(low, **options)
+        # Plain numbers, for JSON.
+        self.description.update({name: int(value) for name, value in options.items()})
 
     def _number(self, option: str, value: float) -> None:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1e6:

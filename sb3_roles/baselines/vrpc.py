@@ -72,12 +72,9 @@ class RoutePlanner(RouteController):
         plan_every: int = 1,
     ) -> None:
         super().__init__(rounds, solutions, seconds, cold)
-        self._whole("target_prize", target_prize, 0)
-        self._whole("cell_prize", cell_prize, 0)
-        self._whole("length_weight", length_weight, 0)
-        self._whole("interest", interest, 0)
-        self._whole("nodes_per_robot", nodes_per_robot, 1)
-        self._whole("plan_every", plan_every, 1)
+        self._whole(0, target_prize=target_prize, cell_prize=cell_prize)
+        self._whole(0, length_weight=length_weight, interest=interest)
+        self._whole(1, nodes_per_robot=nodes_per_robot, plan_every=plan_every)
         self.target_prize, self.cell_prize = target_prize, cell_prize
         self.length_weight, self.interest = length_weight, interest
         self.nodes_per_robot, self.plan_every = nodes_per_robot, plan_every

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 
-def check_positive(**values: int) -> None:
-    """Refuse what is no whole number of at least 1.
 
+def check_whole(low: int, /, **values: int | np.integer[Any]) -> None:
+    """Refuse what is no whole number, Python's or numpy's, of at least ``low``.
+
+    :param low: the least that is allowed
     :param values: name -> value
     :raises ValueError: naming the first wrong one
     """
     for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+        if not whole or value < low:
+            raise ValueError(f"{name} must be a whole number of at least {low}, got {value!r}")
+
+
+def check_positive(**values: int | np.integer[Any]) -> None:
+    """Refuse what is no whole number of at least 1, see :func:`check_whole`.
+
+    :param values: name -> value
+    :raises ValueError: naming the first wrong one
+    """
+    check_whole(1, **values)
 
 
 def check_unit(**values: float) -> None:

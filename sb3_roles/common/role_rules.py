@@ -15,6 +15,10 @@ from sb3_roles.common.roles import Role
 class NearestRole:
     """The role whose goal is nearest: for area search, cover when a known target is nearer.
 
+    What is compared is what the robot observes. In area search with ``sub_goal="nearest"`` that is
+    the nearest goal of each kind; with ``"assigned"`` it is the goal of each kind that was assigned
+    to this robot, however near others are, and a kind of which it was assigned none has nearness 0.
+
     Of equally near goals, the one whose goal set the environment names first is taken; so it is
     when no goal is known.
 

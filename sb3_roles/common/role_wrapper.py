@@ -42,7 +42,9 @@ class RoleWrapper(TeamWrapper):
     Observations get two more keys: ``role``, float32 (n_roles,), the role of the last step as a
     one-hot (all 0 at the start of an episode), and ``role_due``, float32 (1,): 1 when the role
     policy decides in this step, 0 when the role in ``role`` goes on. The role policy decides every
-    ``role_every`` steps of an episode. A controlled role (fixed, random or by a rule) is never due.
+    ``role_every`` steps of an episode. A controlled role (fixed, random or by a rule) is never due:
+    ``role`` is that of the coming step, also in the last observation of an episode, in which the
+    value of going on is asked for.
 
     :param venv: an environment of ``make_team_vec_env``, possibly wrapped, with discrete actions
     :param roles: names of the role registry, or roles
@@ -53,9 +55,10 @@ class RoleWrapper(TeamWrapper):
         in its role (``"same_role"``, the paper), or of the whole ``"team"``
     :param role_every: steps that a role lasts
     :param role_control: ``"learned"``, ``"random"`` (uniform, every ``role_every`` steps),
-        ``"nearest"`` (the role whose goal is nearest, every ``role_every`` steps, see
-        ``NearestRole``) or the name of the role that all robots act in. Random roles are a function
-        of the seed of ``seed()``, the team, and the numbers of episode and step
+        ``"nearest"`` (the role whose goal is nearest, or nearest of those assigned to the robot
+        with ``sub_goal="assigned"``, every ``role_every`` steps, see ``NearestRole``) or the name
+        of the role that all robots act in. Random roles are a function of the seed of ``seed()``,
+        the team, and the numbers of episode and step
     :raises ValueError: if an option is unknown or out of range, the actions are not discrete, or
         the environment does not observe what ``"nearest"`` needs
     """
@@ -139,6 +142,27 @@ class RoleWrapper(TeamWrapper):
             )
         else:
             self.current_roles[:] = self.role_names.index(self.role_control)
+
+    def _extend_terminal(self, infos: list[dict[str, Any]]) -> None:
+        """Extend them, with the role that each robot would have next.
+
+        Its row has no role any more afterwards: ``step_wait`` begins a new episode.
+        """
+        last = {
+            row: info["terminal_observation"]
+            for row, info in enumerate(infos)
+            if "terminal_observation" in info
+        }
+        if last and self.role_control in (RANDOM, NEAREST):
+            rows = np.fromiter(last, np.int64)
+            rows = rows[self._decides()[rows]]
+            if self._rule is None:
+                self.current_roles[rows] = self._random_roles()[rows]
+            elif len(rows):
+                keys = self._rule.keys
+                seen = {key: np.stack([last[row][key] for row in rows]) for key in keys}
+                self.current_roles[rows] = self._rule(seen)
+        super()._extend_terminal(infos)
 
     def _random_roles(self) -> np.ndarray:
         """Roles of the coming step, hashed from (seed of the team, episode, step, robot)."""

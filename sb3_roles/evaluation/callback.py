@@ -1,4 +1,4 @@
-"""``EvaluationCallback``: evaluation on held-out episodes, and the best policy's weights."""
+"""``EvaluationCallback``: evaluation on episodes of its own, and the best policy's weights."""
 
 from __future__ import annotations
 
@@ -54,7 +54,11 @@ def save_policy(model: BaseAlgorithm, folder: Path, record: Mapping[str, Any]) -
 
 
 class EvaluationCallback(TeamCallback):
-    """Evaluates every ``eval_freq`` joint steps, on the same held-out episodes each time.
+    """Evaluates every ``eval_freq`` joint steps, on the same episodes each time.
+
+    By default they are those of a selection stream, see ``evaluation.episodes.selection_seed``: no
+    training plays them, and no results are measured on them, because the best policy was chosen
+    for its luck there, too.
 
     Training goes on as if there were no evaluation: the generators of Python, numpy and torch are
     put back, and the environment of the training is not used. The scores go to the logger as
@@ -62,10 +66,11 @@ class EvaluationCallback(TeamCallback):
 
     :param eval_freq: joint steps (steps of a team, summed over the teams) between evaluations
     :param n_episodes: team episodes of an evaluation, for the default ``evaluate``
-    :param seed: of the held-out episodes, for the default ``evaluate``
+    :param seed: of the selection stream, for the default ``evaluate``
     :param deterministic: take the likeliest actions, for the default ``evaluate``
     :param evaluate: returns the scores of a model by name; by default area search is evaluated by
-        ``evaluation.evaluators.make_evaluator``; ``VecEnvEvaluator`` serves other environments
+        ``evaluation.evaluators.make_evaluator``; ``VecEnvEvaluator`` serves other environments,
+        with ``stream="selection"``
     :param metric: the score that the best policy maximizes; by default ``cover``, or ``return``
         where that is no score
     :param folder: of ``evaluations.csv`` and ``best/``; None to write nothing
@@ -104,7 +109,7 @@ class EvaluationCallback(TeamCallback):
         super()._init_callback()
         if self.evaluate is None:
             self.evaluate = make_evaluator(
-                self.model, self.n_episodes, self.seed, self.deterministic
+                self.model, self.n_episodes, self.seed, self.deterministic, "selection"
             )
         if self._due is None or self._due > self.joint_steps + self.eval_freq:
             self._due = self.joint_steps + self.eval_freq

@@ -15,6 +15,8 @@ import numpy as np
 from area_search.batch import BatchedAreaSearch
 from area_search.scenes import Scene, get_scene
 from sb3_roles._version import __version__
+from sb3_roles.common.checks import check_whole
+from sb3_roles.common.names import closest
 from sb3_roles.evaluation.records import COUNTS, NO_ROLE, EpisodeRecords, distance_type, held
 
 if TYPE_CHECKING:
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
 # Seeds of training teams have 32 bits, see ``team_seeds``: no stream from here on is one of them.
 HELD_OUT = 2**32
+# Beyond the held-out streams of all seeds below 2 ** 63, which is what the command line takes.
+SELECTION = 3 * 2**62
 _VERSIONS = ("numpy", "numba", "torch")
 
 
@@ -31,6 +35,45 @@ def held_out_seed(seed: int) -> int:
     :param seed: of the evaluation, at least 0
     """
     return HELD_OUT + seed
+
+
+def selection_seed(seed: int) -> int:
+    """Return the seed of a stream on which a training run selects its best policy.
+
+    No training plays it, and it is none of the streams that results are measured on: a policy that
+    was selected on episodes looks better on them than it is.
+
+    :param seed: of the evaluation, at least 0 and below 2 ** 62
+    """
+    return SELECTION + seed
+
+
+STREAMS = {"held_out": held_out_seed, "selection": selection_seed}
+"""Kinds of streams that no training plays -> seed of such a stream."""
+
+
+def stream_seed(stream: str, seed: int) -> int:
+    """Return the seed of a stream of one of the kinds.
+
+    :param stream: a name of ``STREAMS``
+    :param seed: of the evaluation
+    :raises ValueError: if there is no such kind
+    """
+    if stream not in STREAMS:
+        raise ValueError(closest("stream", stream, STREAMS))
+    return STREAMS[stream](seed)
+
+
+def stream_of(seed: int) -> tuple[str, int]:
+    """Say which stream a seed is that of: the inverse of :func:`stream_seed`.
+
+    :param seed: what :func:`run_episodes` was given
+    :return: kind, ``"raw"`` for one that a training may play, and the number within the kind
+    """
+    for kind, first in (("selection", SELECTION), ("held_out", HELD_OUT)):
+        if seed >= first:
+            return kind, seed - first
+    return "raw", seed
 
 
 def describe(controller: Controller, scene: Scene, name: str | None = None) -> dict[str, Any]:
@@ -118,6 +161,11 @@ class Player:
         """Int8 (n_teams, n_agents), the roles of the last step, if the controller has any."""
         return getattr(self._controller, "roles", None)
 
+    @property
+    def bounds(self) -> np.ndarray | None:
+        """Float (n_teams,), targets that nobody can exceed, if the controller knows that."""
+        return getattr(self._controller, "bounds", None)
+
 
 def run_episodes(
     controller: Controller,
@@ -136,7 +184,7 @@ def run_episodes(
     Controllers act as a function of the episode alone, so the records depend neither on
     ``batch_size`` nor on how episodes are split over calls, and two controllers that are given the
     same seed play the same episodes. Training plays streams of seeds below 2 ** 32:
-    :func:`held_out_seed` makes one that no training plays.
+    :func:`held_out_seed` makes one that no training plays, neither to learn nor to select.
 
     :param controller: see :class:`~sb3_roles.baselines.base.Controller`
     :param scene: the task
@@ -152,13 +200,8 @@ def run_episodes(
     :raises ValueError: if a number is out of range
     """
     scene = get_scene(scene) if n_agents is None else get_scene(scene, n_agents=n_agents)
-    for what, value, low in (
-        ("n_episodes", n_episodes, 1),
-        ("first_episode", first_episode, 0),
-        ("batch_size", batch_size, 1),
-    ):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
-            raise ValueError(f"{what} must be a whole number of at least {low}, got {value!r}")
+    check_whole(1, n_episodes=n_episodes, batch_size=batch_size)
+    check_whole(0, first_episode=first_episode)
     if sub_goal is None:
         sub_goal = str(getattr(controller, "sub_goal", "none"))
     metadata = describe(controller, scene, name)
@@ -195,6 +238,7 @@ def _empty(scene: Scene, n_episodes: int, first_episode: int) -> EpisodeRecords:
         roles=np.full((*shape, scene.n_agents), NO_ROLE, np.int8),
         decision_seconds=np.full(shape, np.nan, np.float32),
         timing={},
+        bounds=np.full(n_episodes, np.nan),
     )
 
 
@@ -218,6 +262,8 @@ def _play(player: Player, batch: BatchedAreaSearch, records: EpisodeRecords, row
         playing &= ~ended
         if not playing.any():
             break
+    if player.bounds is not None:
+        records.bounds[rows] = player.bounds
     if length.min() < batch.scene.horizon:
         distance[:] = held(distance, length)
         for counts in records.counts.values():

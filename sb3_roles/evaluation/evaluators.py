@@ -15,20 +15,22 @@ from area_search.scenes import Scene, get_scene
 from sb3_roles.common.callbacks import Evaluate
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.common.thresholds import first_above
-from sb3_roles.evaluation.episodes import held_out_seed, run_episodes
+from sb3_roles.evaluation.episodes import run_episodes, stream_seed
 from sb3_roles.evaluation.metrics import t90
 from sb3_roles.evaluation.policies import PolicyController
 
 
 class SceneEvaluator:
-    """Plays held-out episodes of an area-search scene, always the same ones.
+    """Plays episodes of an area-search scene that no training plays, always the same ones.
 
     :param scene: a scene or the name of one; an early stop is switched off
     :param n_episodes: team episodes
-    :param seed: of the held-out stream
+    :param seed: of the stream
     :param deterministic: see :class:`~sb3_roles.evaluation.policies.PolicyController`
     :param role_kwargs: see there; by default those of the model's environment
     :param batch_size: teams simulated together
+    :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
+    :raises ValueError: if there is no such stream
     """
 
     def __init__(
@@ -39,10 +41,11 @@ class SceneEvaluator:
         deterministic: bool = True,
         role_kwargs: Mapping[str, Any] | None = None,
         batch_size: int = 256,
+        stream: str = "held_out",
     ) -> None:
         self.scene = get_scene(scene).with_options(early_stop_patience=None)
         self.n_episodes = n_episodes
-        self.seed = seed
+        self.stream_seed = stream_seed(stream, seed)
         self.deterministic = deterministic
         self.role_kwargs = role_kwargs
         self.batch_size = batch_size
@@ -59,7 +62,7 @@ class SceneEvaluator:
             controller,
             self.scene,
             self.n_episodes,
-            held_out_seed(self.seed),
+            self.stream_seed,
             batch_size=self.batch_size,
         )
         scores = {name: float(curve[:, -1].mean()) for name, curve in records.curves.items()}
@@ -86,17 +89,24 @@ class VecEnvEvaluator:
     :param env: a vectorized environment of its own (not the one that is trained on), wrapped as
         that one is; :meth:`close` closes it
     :param n_episodes: team episodes
-    :param seed: of the environment; streams of training seeds differ from it
+    :param seed: of the stream; the environment's seed is drawn from both
     :param deterministic: handed to ``predict``
+    :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
+    :raises ValueError: if there is no such stream
     """
 
     def __init__(
-        self, env: VecEnv, n_episodes: int = 20, seed: int = 0, deterministic: bool = True
+        self,
+        env: VecEnv,
+        n_episodes: int = 20,
+        seed: int = 0,
+        deterministic: bool = True,
+        stream: str = "held_out",
     ) -> None:
         self.env = env
         self.team_env = find_team_env(env)
         self.n_episodes = n_episodes
-        self.seed = seed
+        self.stream_seed = stream_seed(stream, seed)
         self.deterministic = deterministic
 
     def __call__(self, model: BaseAlgorithm) -> dict[str, float]:
@@ -111,7 +121,7 @@ class VecEnvEvaluator:
         )
         teams, agents = self.team_env.n_teams, self.team_env.n_agents
         # VecEnv.reset() takes the seeds once: the next evaluation plays the same episodes.
-        self.env.seed(held_out_seed(self.seed))
+        self.env.seed(self.stream_seed)
         observations: Any = self.env.reset()
         left = (self.n_episodes + np.arange(teams)) // teams
         returns, length = np.zeros(teams), np.zeros(teams, np.int64)
@@ -143,25 +153,40 @@ class VecEnvEvaluator:
         self.env.close()
 
 
+def area_scene(env: VecEnv | None) -> Scene | None:
+    """Return the scene of an area-search environment, below any wrappers; None of another one.
+
+    :param env: a vectorized environment of teams
+    :raises ValueError: if its rows are not those of a ``TeamVecEnv``
+    """
+    try:
+        scene = find_team_env(env).get_attr("scene", [0])[0]
+    except AttributeError:
+        return None
+    return scene if isinstance(scene, Scene) else None
+
+
 def make_evaluator(
-    model: BaseAlgorithm, n_episodes: int = 100, seed: int = 0, deterministic: bool = True
+    model: BaseAlgorithm,
+    n_episodes: int = 100,
+    seed: int = 0,
+    deterministic: bool = True,
+    stream: str = "held_out",
 ) -> Evaluate:
     """Make the evaluation of a model on the task that it is trained on.
 
     :param model: a model with an area-search environment
     :param n_episodes: team episodes
-    :param seed: of the held-out stream
+    :param seed: of the stream
     :param deterministic: take the likeliest actions
+    :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
     :return: a :class:`SceneEvaluator`
-    :raises ValueError: if the environment is another one
+    :raises ValueError: if the environment is another one, or there is no such stream
     """
-    try:
-        scene = find_team_env(model.env).get_attr("scene", [0])[0]
-    except AttributeError:
-        scene = None
-    if not isinstance(scene, Scene):
+    scene = area_scene(model.env)
+    if scene is None:
         raise ValueError(
             "the environment is not area search: evaluate on a second one, with "
-            "EvaluationCallback(evaluate=VecEnvEvaluator(env))"
+            "EvaluationCallback(evaluate=VecEnvEvaluator(env, stream='selection'))"
         )
-    return SceneEvaluator(scene, n_episodes, seed, deterministic)
+    return SceneEvaluator(scene, n_episodes, seed, deterministic, stream=stream)

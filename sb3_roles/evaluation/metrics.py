@@ -22,13 +22,14 @@ NAMES = (
     "explo_paper",
     "explo_true",
     "cover",
+    "cover_bound",
     "time_e_paper",
     "t90_true",
     "t90_paper",
     "path_length",
     "length",
 )
-"""All metrics, in the order of the reports."""
+"""All metrics, in the order of the reports; ``cover_bound`` only where the controller knows it."""
 _BLOCK = 4_000_000
 
 
@@ -114,7 +115,8 @@ def summarize(records: EpisodeRecords) -> dict[str, dict[str, Any]]:
         confidence interval) and ``unit``. ``explo_paper``, ``explo_true`` and ``cover`` are
         percentages, times and lengths joint steps, ``path_length`` the cells that a robot moved,
         mean over the team; ``t90_*``, over the episodes that get there, also have their ``share``
-        in [0, 1]. What does not exist is None.
+        in [0, 1]. What does not exist is None. ``cover_bound``, the cover that nobody can exceed,
+        in percent and over the episodes of which it is known, is there only if there are any.
     """
     values = _per_episode(records)
     summary = {name: _entry(estimate_mean(each), unit) for name, (each, unit) in values.items()}
@@ -122,9 +124,14 @@ def summarize(records: EpisodeRecords) -> dict[str, dict[str, Any]]:
     summary["time_e_paper"] = _entry(time, "steps")
     for name, times in (("t90_true", records.t90_true), ("t90_paper", records.t90_paper)):
         reached = times >= 0
-        share = float(np.mean(reached))
-        summary[name] = _entry(estimate_mean(times[reached]), "steps", share=share)
-    return {name: summary[name] for name in NAMES}
+        summary[name] = _entry(
+            estimate_mean(times[reached]), "steps", share=float(np.mean(reached))
+        )
+    known = ~np.isnan(records.bounds)
+    if known.any():
+        share = 100.0 * records.bounds[known] / records.n_targets[known]
+        summary["cover_bound"] = _entry(estimate_mean(share), "%")
+    return {name: summary[name] for name in NAMES if name in summary}
 
 
 def decision_time(records: EpisodeRecords) -> dict[str, Any]:
@@ -155,8 +162,8 @@ def paired_differences(
 
     :param records: of one controller
     :param reference: of the other
-    :return: as :func:`summarize`, without ``t90_*``, which not every episode has. Percentages
-        become percentage points
+    :return: as :func:`summarize`, without ``t90_*``, which not every episode has, and
+        ``cover_bound``, which is one of the episode. Percentages become percentage points
     :raises ValueError: if they are not of the same episodes
     """
     for what in ("scene", "seed"):

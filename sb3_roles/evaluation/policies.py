@@ -55,8 +55,10 @@ class PolicyController:
         with, see ``RoleWrapper``, whose other arguments are ignored; by default those of the
         model's environment, if it has one
     :param deterministic: take the likeliest role and move instead of drawing them
-    :param communicate: False switches the messages between robots off
-    :raises ValueError: if an option is unknown, or the policy is none that can be played
+    :param communicate: False switches the messages between robots off; the attribute is None for a
+        policy without any: one of single robots, or of teams without the graph layer
+    :raises ValueError: if an option is unknown, the policy is none that can be played, or it has no
+        messages to switch off
     """
 
     def __init__(
@@ -71,8 +73,11 @@ class PolicyController:
             role_kwargs = role_options(env)
         self.policy = policy.policy if isinstance(policy, BaseAlgorithm) else policy
         self.deterministic = deterministic
-        self.communicate = communicate
         self._chooser = ActionChooser(self.policy, communicate)
+        messages = isinstance(self.policy, TeamPolicy) and self.policy.graph
+        if not (messages or communicate):
+            raise ValueError("its robots exchange no messages that could be switched off")
+        self.communicate = communicate if messages else None
         space = self.policy.observation_space
         known = space.spaces if isinstance(space, spaces.Dict) else {}
         extra = (AGENT_KEY, ROLE_KEY, ROLE_DUE_KEY, STATE_KEY)

@@ -18,6 +18,8 @@ column                       type       meaning
 ``distance_0``, ...          int16      cells that robot 0, ... has moved so far
 ``role_0``, ...              int8       its role in this step, an index of ``role_names``; -1: none
 ``decision_seconds``         float32    time of the controller's decision, for one team
+``cover_bound``              float64    only where the controller knows it: targets that nobody can
+                                        exceed in this episode
 ============================ ========== ==========================================================
 
 Everything else is JSON in the schema's metadata, under the key ``sb3_roles``:
@@ -39,6 +41,7 @@ import numpy as np
 
 from area_search import kernels
 from sb3_roles.common.files import write_atomically
+from sb3_roles.evaluation.header import checked_scene
 
 if TYPE_CHECKING:
     import pyarrow
@@ -93,6 +96,8 @@ class EpisodeRecords:
         the end of the episode
     :param timing: ``seconds``, wall time of the whole simulation, compilation excluded, and
         ``batch_size``, the teams that were simulated together
+    :param bounds: float64 (E,), targets that nobody can exceed in the episode, as the controller
+        says; NaN where it says nothing
     """
 
     metadata: dict[str, Any]
@@ -105,6 +110,7 @@ class EpisodeRecords:
     roles: np.ndarray
     decision_seconds: np.ndarray
     timing: dict[str, Any]
+    bounds: np.ndarray
 
     @cached_property
     def curves(self) -> dict[str, np.ndarray]:
@@ -208,6 +214,8 @@ def _columns(records: EpisodeRecords) -> Iterator[tuple[str, pyarrow.Array]]:
     for name, values in (("distance", records.distance), ("role", records.roles)):
         columns.update({f"{name}_{i}": values[played, i] for i in range(values.shape[2])})
     columns["decision_seconds"] = records.decision_seconds[played]
+    if not np.isnan(records.bounds).all():
+        columns["cover_bound"] = np.repeat(records.bounds, length)
     for name, column in columns.items():
         yield name, pa.array(column)
 
@@ -234,7 +242,7 @@ def read_records(path: str | Path) -> EpisodeRecords:
     if text is None:
         raise RecordsError(f"{path}: a Parquet file, but not one of episode records")
     try:
-        header = json.loads(text)
+        header = json.loads(text, parse_constant=_no_number)
         if header["format"] != FORMAT:
             raise RecordsError(f"{path}: a Parquet file, but not one of episode records")
         if header["format_version"] != FORMAT_VERSION:
@@ -244,11 +252,15 @@ def read_records(path: str | Path) -> EpisodeRecords:
             )
         if header["sha256"] != _digest(header["metadata"], header["timing"]):
             raise RecordsError(f"{path}: damaged records: the metadata are not what was written")
-        return _from_table(table, header)
+        return _from_table(table, header["metadata"], header["timing"])
     except RecordsError:
         raise
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, RecursionError, pa.ArrowException) as error:
         raise RecordsError(f"{path}: damaged records: {_one_line(error)}") from error
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"the metadata hold {name}, which is no JSON")
 
 
 def _one_line(error: Exception) -> str:
@@ -256,9 +268,11 @@ def _one_line(error: Exception) -> str:
     return text if len(text) <= 200 else f"{text[:197]}..."
 
 
-def _from_table(table: pyarrow.Table, header: dict[str, Any]) -> EpisodeRecords:
-    metadata = header["metadata"]
-    horizon, n_agents = metadata["scene"]["horizon"], metadata["scene"]["n_agents"]
+def _from_table(
+    table: pyarrow.Table, metadata: dict[str, Any], timing: dict[str, Any]
+) -> EpisodeRecords:
+    scene = checked_scene(metadata, timing)
+    horizon = scene.horizon
 
     def column(name: str, dtype: Any) -> np.ndarray:
         values = table.column(name).to_numpy()
@@ -274,6 +288,10 @@ def _from_table(table: pyarrow.Table, header: dict[str, Any]) -> EpisodeRecords:
         raise ValueError("the steps do not begin at 0, or go beyond the horizon")
     if not np.array_equal(step, np.arange(len(step)) - np.repeat(first, length)):
         raise ValueError("the steps of an episode do not count up from 0")
+    # Only the early stop ends an episode before: the arrays are no larger than the rows account
+    # for.
+    if length.min() < min(horizon, scene.early_stop_patience or horizon):
+        raise ValueError(f"an episode of {length.min()} steps ended before its scene can end it")
     played = np.arange(horizon) < length[:, None]
 
     def spread(name: str, dtype: Any, fill: float | None = None) -> np.ndarray:
@@ -285,17 +303,33 @@ def _from_table(table: pyarrow.Table, header: dict[str, Any]) -> EpisodeRecords:
         return values
 
     def robots(name: str, dtype: Any, fill: float | None = None) -> np.ndarray:
-        return np.stack([spread(f"{name}_{i}", dtype, fill) for i in range(n_agents)], axis=2)
+        parts = [spread(f"{name}_{i}", dtype, fill) for i in range(scene.n_agents)]
+        return np.stack(parts, axis=2)
 
+    def of_map(name: str, known: int) -> np.ndarray:
+        values = column(name, np.int32)[first]
+        if np.any(values != known):
+            raise ValueError(f"column {name} is not the scene's {known}")
+        return values
+
+    seconds = column("decision_seconds", np.float32)
+    if not np.all((seconds >= 0) & (seconds < np.inf)):
+        raise ValueError("column decision_seconds has entries that are no times")
+    bounds = np.full(len(first), np.nan)
+    if "cover_bound" in table.column_names:
+        bounds = column("cover_bound", np.float64)[first]
+        if np.isinf(bounds).any():
+            raise ValueError("column cover_bound has entries that bound nothing")
     return EpisodeRecords(
         metadata=metadata,
         episode=column("episode", np.int64)[first],
         length=length,
         counts={name: spread(name, np.int32) for name in COUNTS},
-        n_free=column("n_free", np.int32)[first],
-        n_targets=column("n_targets", np.int32)[first],
+        n_free=of_map("n_free", scene.n_free),
+        n_targets=of_map("n_targets", scene.n_targets),
         distance=robots("distance", distance_type(horizon)),
         roles=robots("role", np.int8, NO_ROLE),
         decision_seconds=spread("decision_seconds", np.float32, np.nan),
-        timing=header["timing"],
+        timing=timing,
+        bounds=bounds,
     )

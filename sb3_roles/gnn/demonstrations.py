@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
+import math
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
-import torch as th
-from torch.utils.data import Dataset
 
+from area_search.cells import JOINT_CHANNELS, KNOWN_CHANNELS, N_ACTIONS
+from area_search.kernels import METRICS
 from sb3_roles.common.files import write_atomically
 from sb3_roles.common.policies import POSITION_KEY
 from sb3_roles.common.team_wrapper import AGENT_KEY
 
 FORMAT, FORMAT_VERSION = "sb3_roles demonstrations", 1
-# Maps of a step, in the order of the channels of `known` and then of `joint`.
-MAPS = ("free", "obstacle", "frontier", "target")
-METRICS = ("explo_paper", "explo_true", "cover")
+# Maps of a step: the channels of `known`, and then those of `joint`.
+MAPS = (*KNOWN_CHANNELS, *JOINT_CHANNELS)
 MAX_BYTES = 4 << 30
-_N_ACTIONS = 5
 _FACTS = "facts"
 # Type and number of dimensions of each array.
 _ARRAYS: dict[str, tuple[type, int]] = {
@@ -38,6 +38,11 @@ _ARRAYS: dict[str, tuple[type, int]] = {
 
 class DemonstrationError(ValueError):
     """A file that holds no demonstrations, or others than were asked for; a single line."""
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, for the end of a message of one line."""
+    return " ".join(str(error).split())
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +113,27 @@ class Demonstrations:
         n = self.n_agents
         members = np.stack([np.arange(n), np.full(n, n)], axis=1).astype(np.float32)
         return {
-            "known": maps[:, :2],
-            "joint": maps[:, 2:],
+            "known": maps[:, : len(KNOWN_CHANNELS)],
+            "joint": maps[:, len(KNOWN_CHANNELS) :],
             POSITION_KEY: self.positions[episodes, steps].reshape(-1, 2).astype(np.float32),
             AGENT_KEY: np.tile(members, (len(maps), 1)),
         }
+
+    def digest(self) -> str:
+        """Return the SHA-256 of what was recorded.
+
+        It depends on arrays and facts, but neither on how a file packs them nor on the version of
+        this program: a recording that was made again or went on has the same for its first
+        episodes.
+        """
+        facts = {key: value for key, value in self.facts.items() if key != "version"}
+        content = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+        for name in _ARRAYS:
+            if name != _FACTS:
+                array = np.ascontiguousarray(getattr(self, name))
+                content.update(f"{name} {array.shape}".encode())
+                content.update(array.astype(array.dtype.newbyteorder("<")).data)
+        return content.hexdigest()
 
     def save(self, path: Path) -> None:
         """Write a file, so that a crash at any moment leaves the old one or the new one.
@@ -163,6 +184,7 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
     except (
         zipfile.BadZipFile,
         ValueError,
+        OverflowError,
         KeyError,
         TypeError,
         EOFError,
@@ -170,8 +192,8 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
         RuntimeError,
         zipfile.zlib.error,  # type: ignore[attr-defined]
     ) as error:
-        message = " ".join(str(error).split())
-        raise DemonstrationError(f"{path}: damaged demonstrations: {message}") from error
+        message = f"{path}: damaged demonstrations: {one_line(error)}"
+        raise DemonstrationError(message) from error
     if problem is not None:
         raise DemonstrationError(f"{path}: damaged demonstrations: {problem}")
     return found
@@ -184,19 +206,42 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             raise DemonstrationError(f"{path}: no demonstrations of sb3_roles")
         if sum(entry.file_size for entry in entries) > MAX_BYTES:
             raise DemonstrationError(f"{path}: more than {MAX_BYTES} bytes when unpacked")
+        for entry in entries:
+            # What this program writes; others fail with errors of their own libraries.
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise DemonstrationError(f"{path}: {entry.filename} is not packed by numpy")
+            with archive.open(entry) as file:
+                problem = _header_problem(file, entry)
+            if problem is not None:
+                raise DemonstrationError(f"{path}: damaged demonstrations: {problem}")
     with np.load(path, allow_pickle=False) as content:
-        arrays = {name: content[name] for name in _ARRAYS}
-    for name, (dtype, n_dimensions) in _ARRAYS.items():
-        array = arrays[name]
-        if array.dtype != dtype or array.ndim != n_dimensions:
-            raise DemonstrationError(
-                f"{path}: damaged demonstrations: {name} is {array.dtype} of shape {array.shape}"
-            )
-    return arrays
+        return {name: content[name] for name in _ARRAYS}
+
+
+def _header_problem(file: IO[bytes], entry: zipfile.ZipInfo) -> str | None:
+    """Say what is wrong with the head of an array, before memory is given to what it declares."""
+    name = entry.filename.removesuffix(".npy")
+    dtype, n_dimensions = _ARRAYS[name]
+    if np.lib.format.read_magic(file) != (1, 0):
+        return f"{name} has another version of numpy's format"
+    shape, _, found = np.lib.format.read_array_header_1_0(file)
+    if found != dtype or len(shape) != n_dimensions:
+        return f"{name} is {found} of shape {shape}"
+    expected, there = math.prod(shape) * found.itemsize, entry.file_size - file.tell()
+    if expected != there:
+        return f"{name} declares {expected} bytes, and has {there}"
+    return None
 
 
 def _problem(found: Demonstrations) -> str | None:
     """Say what does not fit together."""
+    controller, scene = found.facts["controller"], found.facts["scene"]
+    if not isinstance(controller, str) or not controller.isprintable():
+        return f"the controller is {controller!r}"
+    for key in ("height", "width"):
+        side = scene[key]
+        if isinstance(side, bool) or not isinstance(side, int) or side < 1:
+            return f"the scene's {key} must be a whole number of at least 1, got {side!r}"
     (height, width), n = found.size, len(found)
     length, n_agents = found.actions.shape[1:]
     shapes = {
@@ -210,41 +255,8 @@ def _problem(found: Demonstrations) -> str | None:
             return f"{name} have shape {getattr(found, name).shape}, expected {shape}"
     if not found.actions.size:
         return "there are no steps"
-    if found.actions.min() < 0 or found.actions.max() >= _N_ACTIONS:
-        return f"actions must be in 0..{_N_ACTIONS - 1}"
+    if found.actions.min() < 0 or found.actions.max() >= N_ACTIONS:
+        return f"actions must be in 0..{N_ACTIONS - 1}"
     if found.positions.min() < 0 or (found.positions >= (height, width)).any():
         return "a position is not on the map"
     return None
-
-
-class JointSteps(Dataset):
-    """The steps of some episodes, as a data set of PyTorch; one item is one step of the team.
-
-    :param demonstrations: the episodes
-    :param rows: which of them
-    """
-
-    def __init__(self, demonstrations: Demonstrations, rows: Sequence[int] | np.ndarray) -> None:
-        self.demonstrations = demonstrations
-        self.rows = np.asarray(rows, np.int64)
-
-    def __len__(self) -> int:
-        return len(self.rows) * self.demonstrations.n_steps
-
-    def __getitem__(self, index: int) -> tuple[dict[str, th.Tensor], th.Tensor]:
-        """Return one step, see :meth:`__getitems__`."""
-        return self.__getitems__([index])
-
-    def __getitems__(self, indices: Sequence[int]) -> tuple[dict[str, th.Tensor], th.Tensor]:
-        """Return some steps at once, which is what a ``DataLoader`` asks for.
-
-        :param indices: of b items
-        :return: observations of b teams by key, and actions int64 (b N,)
-        """
-        order, steps = np.divmod(np.asarray(indices, np.int64), self.demonstrations.n_steps)
-        episodes = self.rows[order]
-        observed = self.demonstrations.observe(episodes, steps)
-        actions = self.demonstrations.actions[episodes, steps].reshape(-1).astype(np.int64)
-        return {key: th.from_numpy(array) for key, array in observed.items()}, th.from_numpy(
-            actions
-        )

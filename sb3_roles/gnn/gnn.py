@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,14 +14,22 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import obs_as_tensor, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
-from torch.utils.data import DataLoader
 
 from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
 from sb3_roles.common.distributions import LOG_ZERO
 from sb3_roles.common.policies import TeamPolicy
-from sb3_roles.common.team_wrapper import find_team_env
-from sb3_roles.gnn.demonstrations import Demonstrations, JointSteps, load_demonstrations
+from sb3_roles.gnn.demonstrations import DemonstrationError, one_line
+from sb3_roles.gnn.joint_steps import JointSteps, batches, moved
 from sb3_roles.gnn.policies import GNNPolicy
+from sb3_roles.gnn.source import (
+    check_recording,
+    describe,
+    environment_scene,
+    obtain,
+    summary,
+    validation_episodes,
+)
+from sb3_roles.gnn.state import CloningState, check_same_demonstrations, plain_state, read_state
 from sb3_roles.mappo.mappo import MAPPO
 
 DEMONSTRATIONS_FILE = "demonstrations.npz"
@@ -107,6 +115,7 @@ class GNN(MAPPO):
         self.best_epoch, self.best_loss = 0, float("inf")
         self.best_weights: dict[str, th.Tensor] = {}
         self._data: tuple[JointSteps, JointSteps] | None = None
+        self.facts: dict[str, Any] = {}
         super().__init__(
             policy,
             env,
@@ -133,42 +142,76 @@ class GNN(MAPPO):
 
     # Demonstrations
 
-    def data(self) -> tuple[JointSteps, JointSteps]:
+    def check_data(self) -> None:
+        """Look for what there is to learn from, without recording anything.
+
+        :raises ValueError: if :meth:`data` would say so
+        :raises ImportError: if the controller needs what is not installed; one line
+        """
+        if self.demonstrations is None:
+            validation_episodes(self.n_demonstrations, self.validation_share)
+            check_recording(self.controller, environment_scene(self.env))
+        else:
+            self.data()
+
+    def data(self, report: Callable[[int], None] | None = None) -> tuple[JointSteps, JointSteps]:
         """Return the steps to learn from and those to validate on, recorded first if need be.
 
-        :raises DemonstrationError: if the file is damaged, or has too few episodes
-        :raises ValueError: if there is none, and the environment is not area search
+        :param report: told how many episodes are recorded, from time to time
+        :raises DemonstrationError: if the file is damaged, has too few episodes, or is nothing
+            that the policy can read
+        :raises ValueError: if there is none and the environment is not area search, if there is
+            nothing to validate on or to learn from, or if a demonstrated move is impossible
+        :raises ImportError: if the controller needs what is not installed; one line
         """
         if self._data is None:
-            if self.demonstrations is not None:
-                found = load_demonstrations(self.demonstrations).first(self.n_demonstrations)
-            else:
-                found = self._record()
+            n_validation = validation_episodes(self.n_demonstrations, self.validation_share)
+            # There is no logger before learn().
+            logger = getattr(self, "_logger", None)
+            folder = None if logger is None else logger.dir
+            found = obtain(
+                self.demonstrations,
+                self.controller,
+                environment_scene(self.env),
+                self.n_demonstrations,
+                self.seed or 0,
+                None if folder is None else Path(folder) / DEMONSTRATIONS_FILE,
+                report or self._report,
+            )
             order = self._generator(_SPLIT).permutation(len(found))
-            n_validation = round(self.validation_share * len(found))
-            if not 0 < n_validation < len(found):
-                raise ValueError(
-                    f"validation_share {self.validation_share} of {len(found)} episodes leaves "
-                    "none to validate on, or none to learn from"
-                )
             train, validation = order[n_validation:], order[:n_validation]
-            self._data = JointSteps(found, train), JointSteps(found, validation)
+            data = JointSteps(found, train), JointSteps(found, validation)
+            self._check_readable(data[0])
+            self._data, self.facts = data, describe(found, self.demonstrations)
+            if self.verbose:
+                print(self.summary(), flush=True)
         return self._data
 
-    def _record(self) -> Demonstrations:
-        try:
-            scene = find_team_env(self.env).get_attr("scene", [0])[0]
-        except AttributeError:
-            raise ValueError(
-                "the environment is not area search: give demonstrations, a file of them"
-            ) from None
-        from sb3_roles.gnn.recording import record
+    def summary(self) -> str:
+        """Say in one line what is learned from, and how its scene differs from the environment's.
 
-        folder = self.logger.dir
-        path = None if folder is None else Path(folder) / DEMONSTRATIONS_FILE
+        :raises ValueError: see :meth:`data`
+        """
+        self.data()
+        return summary(self.facts, environment_scene(self.env))
+
+    def _report(self, count: int) -> None:
         if self.verbose:
-            print(f"recording {self.n_demonstrations} episodes of {self.controller}", flush=True)
-        return record(self.controller, scene, self.n_demonstrations, self.seed or 0, path)
+            of = f"{self.n_demonstrations} episodes of {self.controller}"
+            print(f"recorded {count} of {of}", flush=True)
+
+    def _check_readable(self, steps: JointSteps) -> None:
+        """Refuse maps and teams that the policy was not built for; those of GNN read any."""
+        found = steps.demonstrations
+        self.policy.set_training_mode(False)
+        try:
+            with th.inference_mode():
+                self._cross_entropy(*moved(*steps[0], self.device))
+        except (KeyError, IndexError, RuntimeError) as error:
+            raise DemonstrationError(
+                f"{type(self.policy).__name__} can not read demonstrations of {found.n_agents} "
+                f"robots on {found.size[0]} x {found.size[1]} cells: {one_line(error)}"
+            ) from error
 
     def _generator(self, *purpose: int) -> np.random.Generator:
         """Return a generator of its own for each purpose: epochs can be resumed."""
@@ -212,8 +255,9 @@ class GNN(MAPPO):
         train, validation = self.data()
         self.policy.set_training_mode(True)
         seed = int(self._generator(_ORDER, self.epochs).integers(2**62))
+        shuffle = th.Generator().manual_seed(seed)
         losses, right = [], []
-        for batch in self._batches(train, self.batch_size, th.Generator().manual_seed(seed)):
+        for batch in batches(train, self.batch_size, self.device, shuffle):
             rate = self.learning_rate * self.lr_decay ** (self._n_updates // self.lr_decay_every)  # type: ignore[operator]
             update_learning_rate(self.policy.optimizer, rate)
             loss, accuracy = self._cross_entropy(*batch)
@@ -249,26 +293,11 @@ class GNN(MAPPO):
         """
         self.policy.set_training_mode(False)
         total = np.zeros(3)
-        for observations, actions in self._batches(steps, _VALIDATION_BATCH):
+        for observations, actions in batches(steps, _VALIDATION_BATCH, self.device):
             with th.inference_mode():
                 loss, accuracy = self._cross_entropy(observations, actions)
             total += len(actions) * np.array([float(loss), float(accuracy), 1.0])
         return float(total[0] / total[2]), float(total[1] / total[2])
-
-    def _batches(
-        self, steps: JointSteps, batch_size: int, generator: th.Generator | None = None
-    ) -> Iterator[tuple[dict[str, th.Tensor], th.Tensor]]:
-        """Go through some steps, shuffled if there is a generator."""
-        loader = DataLoader(
-            steps,
-            batch_size,
-            shuffle=generator is not None,
-            generator=generator,
-            collate_fn=lambda batch: batch,
-        )
-        for observations, actions in loader:
-            moved = {key: value.to(self.device) for key, value in observations.items()}
-            yield moved, actions.to(self.device)
 
     def _cross_entropy(
         self, observations: Mapping[str, th.Tensor], actions: th.Tensor
@@ -283,18 +312,20 @@ class GNN(MAPPO):
 
     def get_state(self) -> dict[str, Any]:
         """Return what the coming epochs depend on, beside weights and counters."""
-        return {
-            "epochs": self.epochs,
-            "best_epoch": self.best_epoch,
-            "best_loss": self.best_loss,
-            "best_weights": {k: v.cpu().numpy() for k, v in self.best_weights.items()},
-        }
+        return plain_state(
+            CloningState(self.epochs, self.best_epoch, self.best_loss, self.best_weights),
+            self.facts,
+        )
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from what :meth:`get_state` returned."""
-        self.epochs, self.best_epoch = int(state["epochs"]), int(state["best_epoch"])
-        self.best_loss = float(state["best_loss"])
-        self.best_weights = {
-            name: th.from_numpy(np.array(value)).to(self.device)
-            for name, value in state["best_weights"].items()
-        }
+        """Continue from what :meth:`get_state` returned.
+
+        :raises CheckpointError: if it is damaged, does not fit the policy, or the demonstrations
+            are others; nothing is changed then
+        """
+        found, facts = read_state(state, self.policy.state_dict())
+        if facts:
+            self.data()
+            check_same_demonstrations(facts, self.facts)
+        self.epochs, self.best_epoch = found.epochs, found.best_epoch
+        self.best_loss, self.best_weights = found.best_loss, dict(found.best_weights)

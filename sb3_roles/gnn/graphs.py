@@ -18,12 +18,10 @@ import numpy as np
 import torch as th
 from numba import njit
 
+from area_search.cells import MOVE_COLUMNS, MOVE_ROWS, N_ACTIONS
+
 NODE_FEATURES = ("robot", "cell", "target", "frontier")
 N_FEATURES = len(NODE_FEATURES)
-# Where the actions lead: stop, up, right, down, left.
-_ROWS = np.array([0, -1, 0, 1, 0], np.int64)
-_COLUMNS = np.array([0, 0, 1, 0, -1], np.int64)
-N_MOVES = len(_ROWS)
 
 
 class TeamGraphs(NamedTuple):
@@ -88,11 +86,11 @@ def _build(
                 most += free[m, y, x] > 0
     features = np.zeros((most, N_FEATURES), np.float32)
     starts = np.zeros(most + 1, np.int64)
-    senders = np.empty(4 * most + 2 * N_MOVES * n_teams * n_agents, np.int64)
+    senders = np.empty(4 * most + 2 * N_ACTIONS * n_teams * n_agents, np.int64)
     lengths = np.empty(len(senders), np.int64)
     teams = np.zeros(n_teams + 1, np.int64)
-    ends = np.empty((n_teams, n_agents, 1 + N_MOVES), np.int64)
-    is_open = np.zeros((n_teams, n_agents, N_MOVES), np.bool_)
+    ends = np.empty((n_teams, n_agents, 1 + N_ACTIONS), np.int64)
+    is_open = np.zeros((n_teams, n_agents, N_ACTIONS), np.bool_)
     # A border of "no node" saves the bounds checks.
     node = np.empty((height + 2, width + 2), np.int64)
     visitors = np.empty((height + 2, width + 2), np.int64)
@@ -120,8 +118,8 @@ def _build(
                     continue
                 starts[k] = n_edges
                 near = 0
-                for a in range(N_MOVES):
-                    yy, xx = y + _ROWS[a], x + _COLUMNS[a]
+                for a in range(N_ACTIONS):
+                    yy, xx = y + MOVE_ROWS[a], x + MOVE_COLUMNS[a]
                     near += visitors[yy, xx]
                     if a > 0 and node[yy, xx] >= 0:
                         senders[n_edges] = node[yy, xx]
@@ -141,8 +139,10 @@ def _build(
             starts[own] = n_edges
             features[own, 0] = 1.0
             ends[m, i, 0] = own
-            for a in range(N_MOVES):
-                cell = node[position[m, i, 0] + 1 + _ROWS[a], position[m, i, 1] + 1 + _COLUMNS[a]]
+            for a in range(N_ACTIONS):
+                cell = node[
+                    position[m, i, 0] + 1 + MOVE_ROWS[a], position[m, i, 1] + 1 + MOVE_COLUMNS[a]
+                ]
                 is_open[m, i, a] = cell >= 0
                 ends[m, i, 1 + a] = cell if cell >= 0 else own
                 if cell >= 0:
@@ -157,6 +157,6 @@ def _build(
         senders[:n_edges],
         lengths[:n_edges],
         teams,
-        ends.reshape(-1, 1 + N_MOVES),
-        is_open.reshape(-1, N_MOVES),
+        ends.reshape(-1, 1 + N_ACTIONS),
+        is_open.reshape(-1, N_ACTIONS),
     )

@@ -13,18 +13,18 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 from torch.nn import functional as F
 
+from area_search.cells import JOINT_CHANNELS, KNOWN_CHANNELS, N_ACTIONS
 from sb3_roles.common.checks import check_positive
 from sb3_roles.common.distributions import LOG_ZERO
 from sb3_roles.common.policies import POSITION_KEY, Observation
 from sb3_roles.common.torch_layers import Head, mlp
-from sb3_roles.gnn.graphs import N_MOVES, TeamGraphs, build_graphs
+from sb3_roles.gnn.graphs import TeamGraphs, build_graphs
 from sb3_roles.gnn.message_passing import MessagePassing
 from sb3_roles.mappo.policies import TeamActorCriticPolicy
 
 JOINT_KEY, KNOWN_KEY = "joint", "known"
-# Channels of area search's maps.
-_FRONTIER, _TARGET = 0, 1
-_FREE = 0
+_FRONTIER, _TARGET = JOINT_CHANNELS.index("frontier"), JOINT_CHANNELS.index("target")
+_FREE = KNOWN_CHANNELS.index("free")
 
 
 class GraphActorCriticPolicy(TeamActorCriticPolicy):
@@ -82,8 +82,8 @@ class GraphActorCriticPolicy(TeamActorCriticPolicy):
                 f"{type(self).__name__} reads the key {missing[0]!r}, which this environment does "
                 "not observe: give area search env_kwargs {known_map: true}"
             )
-        if not isinstance(action_space, spaces.Discrete) or int(action_space.n) != N_MOVES:
-            raise ValueError(f"{type(self).__name__} needs area search's {N_MOVES} moves")
+        if not isinstance(action_space, spaces.Discrete) or int(action_space.n) != N_ACTIONS:
+            raise ValueError(f"{type(self).__name__} needs area search's {N_ACTIONS} moves")
         check_positive(n_hops=n_hops, hop_width=hop_width)
         self.n_hops, self.hop_width = n_hops, hop_width
         self._given: dict[str, Any] = {
@@ -131,7 +131,7 @@ class GraphActorCriticPolicy(TeamActorCriticPolicy):
         self.action_net = Head(self._build_readout(), self.head_arch, 1, gain=0.01)
         size = self._add_encoders("value_primitive", self.critic_keys)
         self.value_net = Head(size, self.value_arch, 1, gain=1.0)  # type: ignore[assignment]
-        self.action_dist = CategoricalDistribution(N_MOVES)
+        self.action_dist = CategoricalDistribution(N_ACTIONS)
 
     @abstractmethod
     def _build_readout(self) -> int:
@@ -255,4 +255,4 @@ class H2GNNPolicy(GraphActorCriticPolicy):
         return self.attended((weights.unsqueeze(-1) * values).sum(1).flatten(1))
 
     def _readout(self, ends: th.Tensor) -> th.Tensor:
-        return self._decode(self.attend(ends.flatten(0, 1)).view(len(ends), 1 + N_MOVES, -1))
+        return self._decode(self.attend(ends.flatten(0, 1)).view(len(ends), 1 + N_ACTIONS, -1))

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from area_search.batch import BatchedAreaSearch
+from area_search.kernels import METRICS
 from area_search.scenes import Scene, get_scene
 from sb3_roles._version import __version__
 from sb3_roles.baselines import controller_class
+from sb3_roles.common.checks import check_whole
 from sb3_roles.gnn.demonstrations import (
-    METRICS,
     DemonstrationError,
     Demonstrations,
     load_demonstrations,
@@ -58,13 +59,8 @@ def record(
     :raises DemonstrationError: if the file is damaged, or of another controller, scene or seed
     :raises ValueError: if a number is out of range, or the controller or scene unknown
     """
-    for what, value, low in (
-        ("n_episodes", n_episodes, 1),
-        ("batch_size", batch_size, 1),
-        ("seed", seed, 0),
-    ):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
-            raise ValueError(f"{what} must be a whole number of at least {low}, got {value!r}")
+    check_whole(1, n_episodes=n_episodes, batch_size=batch_size)
+    check_whole(0, seed=seed)
     scene = get_scene(scene).with_options(early_stop_patience=None)
     player: Any = controller_class(controller)() if isinstance(controller, str) else controller
     if name is None:

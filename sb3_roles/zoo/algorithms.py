@@ -196,6 +196,9 @@ class Algorithm:
     :param whole_teams: what a team shares is handed over once per team; False repeats it by row
     :param masks: the environment tells which moves are blocked
     :param holds_roles: its policy keeps a role that goes on, so that roles may last or be given
+    :param clones: it learns from demonstrations, and batches are of those: it has ``check_data()``,
+        ``data()``, ``facts`` and ``summary()`` of :class:`~sb3_roles.gnn.gnn.GNN`
+    :param options: defaults of ``sb3-roles train`` that are its own
     """
 
     name: str
@@ -208,6 +211,8 @@ class Algorithm:
     whole_teams: bool = True
     masks: bool = False
     holds_roles: bool = True
+    clones: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     def load(self) -> Any:
         """Import the class."""
@@ -300,7 +305,7 @@ ALGORITHMS: dict[str, Algorithm] = {
                 "demonstrations": Text(optional=True),
                 "controller": Choice(CONTROLLER_NAMES),
                 "n_demonstrations": Whole(2, 1e6),
-                "validation_share": _UNIT,
+                "validation_share": Number(0.0, 1.0, above=True),
                 "learning_rate": Number(0.0, 10.0),
                 "lr_decay": _UNIT,
                 "lr_decay_every": Whole(1, 1e9),
@@ -310,6 +315,9 @@ ALGORITHMS: dict[str, Algorithm] = {
                 "stats_window_size": Whole(1, 1e6),
             },
             batch_in_rows=False,
+            clones=True,
+            # Five epochs of its configuration: joint steps are few where playing teaches nothing.
+            options={"eval_freq": 1000, "save_freq": 1000},
         ),
         Algorithm(
             "h2gnn",

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 RATE_TARGETS = {"hmappo native": 1_500}
 PARTS = ("environment", "inference", "buffer", "update")
 _BACKENDS = ("native", "supersuit")
+# What is cloned from demonstrations has no rollouts to learn from, so no steps to be measured by.
+_MEASURED = [name for name, one in ALGORITHMS.items() if not one.clones]
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -41,10 +43,11 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--algo",
-        type=several_of("algorithm", ALGORITHMS),
+        type=several_of("algorithm", _MEASURED),
         default=("hmappo",),
         metavar="NAME,...",
-        help=f"from {', '.join(ALGORITHMS)}",
+        help=f"from {', '.join(_MEASURED)}; gnn clones demonstrations and learns from no rollouts, "
+        "so there is nothing to measure",
     )
     parser.add_argument(
         "--vec-env",

@@ -10,6 +10,7 @@ from sb3_roles.common.roles import ROLES, role_controls
 from sb3_roles.zoo.algorithms import ALGORITHMS, POLICY_ARGUMENTS, Algorithm
 from sb3_roles.zoo.environments import (
     AREA_SEARCH,
+    GOAL_SETS,
     REWARD_COMPONENTS,
     env_problems,
     scene_of_run,
@@ -123,7 +124,8 @@ def _together(config: Mapping[str, Any]) -> list[str]:
     """What is wrong with values that are right one by one."""
     found: list[str] = []
     n_steps, batch_size = config.get("n_steps"), config.get("batch_size")
-    if n_steps and batch_size and batch_size > n_steps * config["n_envs"]:
+    of_rollout = not ALGORITHMS[config["algo"]].clones
+    if of_rollout and n_steps and batch_size and batch_size > n_steps * config["n_envs"]:
         found.append(
             f"batch_size must be at most n_steps x n_envs = {n_steps} x {config['n_envs']} = "
             f"{n_steps * config['n_envs']} joint steps, got {batch_size}"
@@ -151,4 +153,18 @@ def _together(config: Mapping[str, Any]) -> list[str]:
             for key in ("alpha", "beta")
             if key in env_kwargs
         ]
+        found += _goal_problems(config)
     return found
+
+
+def _goal_problems(config: Mapping[str, Any]) -> list[str]:
+    """Rows of ``sub_goal`` are those of the goal sets, and a policy takes row k for role k."""
+    roles = [ROLES[name] for name in config["wrapper_kwargs"].get("roles", ("explore", "cover"))]
+    sets = tuple(role.goal_set for role in roles)
+    if config["policy_kwargs"].get("goal_key") != "sub_goal" or sets == GOAL_SETS:
+        return []
+    return [
+        f"policy_kwargs.goal_key: the rows of sub_goal are for {' and '.join(GOAL_SETS)}, but the "
+        f"roles {', '.join(role.name for role in roles)} head for "
+        f"{', '.join(name or 'nothing' for name in sets)}"
+    ]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from sb3_roles.baselines import CONTROLLER_NAMES
 from sb3_roles.zoo.options import (
+    MAX_TRAINING_SEED,
     UsageError,
     add_scene_options,
     one_of,
@@ -18,9 +19,6 @@ from sb3_roles.zoo.options import (
 
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
-
-# Streams of demonstrations are counted from here, see ``gnn.recording``.
-_MAX_SEED = 2**32 - 1
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -44,7 +42,11 @@ def add_parser(subparsers: Subparsers) -> None:
         "--episodes", type=whole_number(1, 10**6), default=200, metavar="N", help="number of them"
     )
     parser.add_argument(
-        "--seed", type=whole_number(0, _MAX_SEED), default=0, metavar="N", help="of the episodes"
+        "--seed",
+        type=whole_number(0, MAX_TRAINING_SEED),
+        default=0,
+        metavar="N",
+        help="of the episodes",
     )
     parser.add_argument(
         "--batch-size",
@@ -64,10 +66,12 @@ def run(args: Namespace) -> int:
 
     :param args: parsed arguments
     :return: exit code
-    :raises UsageError: if the options do not describe a scene, or the file is of other episodes
+    :raises UsageError: if the options do not describe a scene, the controller needs what is not
+        installed, or the file is of other episodes
     """
     scene = scene_of(args)
-    from sb3_roles.gnn.demonstrations import METRICS, DemonstrationError
+    from area_search.kernels import METRICS
+    from sb3_roles.gnn.demonstrations import DemonstrationError
     from sb3_roles.gnn.recording import record
 
     def report(count: int) -> None:
@@ -85,6 +89,8 @@ def run(args: Namespace) -> int:
         )
     except DemonstrationError as error:
         raise UsageError(f"argument --out: {error}") from None
+    except ImportError as error:
+        raise UsageError(f"argument --controller: {error}") from None
     means = zip(METRICS, 100 * found.metrics.mean(axis=0), strict=True)
     print(
         f"{args.out}: {len(found)} episodes of {args.controller}, {found.n_steps} steps of "

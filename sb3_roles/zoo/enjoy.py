@@ -240,7 +240,7 @@ def _episodes(
         if config["env"] == AREA_SEARCH:
             from sb3_roles.evaluation.episodes import held_out_seed
 
-            scene, links = scene_of_run(config), controller.communicate
+            scene, links = scene_of_run(config), bool(controller.communicate)
             # The episodes that `evaluate --seed` scores.
             seed = held_out_seed(args.seed)
             for episode in range(args.episodes):

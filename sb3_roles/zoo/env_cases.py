@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from area_search.scenes import Scene, get_scene
+from sb3_roles.zoo.environments import SUB_GOALS
 
 if TYPE_CHECKING:
     import numpy as np
 
-SUB_GOALS = ("none", "nearest", "assigned")
 N_TEAMS, N_TEAMS_SUPERSUIT = 128, 8
 ROBOTS, SIDES = (1, 4, 15, 50), (25, 50, 100, 200)
 TARGET_DENSITY = 0.16

@@ -22,6 +22,7 @@ AREA_SEARCH = "area-search-v0"
 ENVIRONMENTS: dict[str, str] = {AREA_SEARCH: "area_search:AreaSearchEnv"}
 # area_search has both lists, behind numba, which takes a second to import.
 SUB_GOALS = ("none", "nearest", "assigned")
+GOAL_SETS = ("frontier", "target")
 REWARD_COMPONENTS = ("explore", "cover")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 

@@ -35,12 +35,13 @@ if TYPE_CHECKING:
 
 DEFAULT = "random"
 HELD_OUT_NOTE = (
-    "The episodes come from held-out streams, which no training plays: of the same seed, they are "
-    "other ones than those of a training run. Every controller plays the same episodes. Intervals "
-    "are 95 % confidence intervals: Student's t over the episodes, and bootstrap percentiles for "
-    "time_e_paper."
+    "The episodes come from held-out streams, which no training plays, neither to learn nor to "
+    "select its best policy: of the same seed, they are other ones than those of a run. Every "
+    "controller plays the same episodes. Intervals are 95 % confidence intervals: Student's t over "
+    "the episodes, and bootstrap percentiles for time_e_paper."
 )
 _OUTPUTS = ("out", "render")
+_OF_POLICIES = ("stochastic", "no_communication", "load_best")
 
 
 def names_of(text: str) -> list[str]:
@@ -169,13 +170,21 @@ def make_controllers(args: Namespace, names: Sequence[str]) -> dict[str, Control
     :param args: parsed arguments, for how a policy acts
     :param names: run folders, or of scripted controllers
     :return: by name, in the same order
-    :raises UsageError: if one does not exist, is damaged, or needs a package that is missing
+    :raises UsageError: if one does not exist, is damaged, needs a package that is missing, or can
+        not act as the options say
     """
     for name in names:
         # An empty name would be the folder that the command was started in.
         if name not in CONTROLLER_NAMES and not (name and Path(name).is_dir()):
             message = closest("controller or run folder", name, CONTROLLER_NAMES)
             raise UsageError(f"argument --controller: {message}")
+    if all(name in CONTROLLER_NAMES for name in names):
+        for option in _OF_POLICIES:
+            if getattr(args, option, False):
+                raise UsageError(
+                    f"argument --{option.replace('_', '-')}: only policies of runs heed it, and "
+                    "only scripted controllers are named"
+                )
     made: dict[str, Controller] = {}
     for name in names:
         if name in CONTROLLER_NAMES:

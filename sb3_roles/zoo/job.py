@@ -6,7 +6,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -42,8 +42,8 @@ from sb3_roles.zoo.run_folder import (
 )
 from sb3_roles.zoo.training import CsvLog, StopSignals, train
 
-# The periodic evaluation picks the best policy; the last one is on other episodes.
-_PERIODIC_SEED, _FINAL_SEED = 0, 1
+# The periodic evaluation selects the best policy, on a stream that no --seed of a command reaches.
+_SELECTION_SEED, _FINAL_SEED = 0, 1
 _MAX_EVAL_TEAMS = 8
 
 
@@ -71,6 +71,8 @@ def run_job(job: Mapping[str, Any]) -> int:
     env = make_env(config)
     try:
         model = make_model(config, env, options["device"])
+        if get_algorithm(config["algo"]).clones:
+            _ask(config, model.check_data)  # type: ignore[attr-defined]
         run, lock = _open_run(job)
         try:
             return _train_in(run, model, job)
@@ -78,6 +80,33 @@ def run_job(job: Mapping[str, Any]) -> int:
             lock.release()
     finally:
         env.close()
+
+
+def _ask(config: Mapping[str, Any], question: Callable[[], object]) -> None:
+    """Turn what an algorithm has to say of its data into an error of the command line."""
+    try:
+        question()
+    except (ValueError, ImportError) as error:
+        raise UsageError(f"{config['algo']}: {' '.join(str(error).split())}") from error
+
+
+def _get_demonstrations(run: Path, model: Any, job: Mapping[str, Any]) -> None:
+    """Read or record what is cloned, while Ctrl-C still stops at once, and note what it is."""
+    config, options = job["config"], job["options"]
+
+    def report(count: int) -> None:
+        if options["verbose"]:
+            of = f"{model.n_demonstrations} episodes of {model.controller}"
+            print(f"recorded {count} of {of}", flush=True)
+
+    try:
+        _ask(config, lambda: model.data(report))
+    except KeyboardInterrupt:
+        print(f"recording stopped; {run} keeps the episodes so far, and no policy", flush=True)
+        raise
+    print(model.summary(), flush=True)
+    if job["resume"] is None:
+        write_yaml(run / "demonstrations.yml", model.facts)
 
 
 def _open_run(job: Mapping[str, Any]) -> tuple[Path, RunLock]:
@@ -118,6 +147,8 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
         model.set_logger(logger)
         callbacks = _callbacks(run, model, config, options, stack)
         _print_start(run, model, config, None if resume is None else begun)
+        if get_algorithm(config["algo"]).clones:
+            _get_demonstrations(run, model, job)
 
         def begin() -> None:
             if resume is not None:
@@ -179,8 +210,8 @@ def _callbacks(
         evaluation = EvaluationCallback(
             eval_freq=options["eval_freq"],
             n_episodes=n_episodes,
-            seed=_PERIODIC_SEED,
-            evaluate=make_evaluate(config, n_episodes, _PERIODIC_SEED),
+            seed=_SELECTION_SEED,
+            evaluate=make_evaluate(config, n_episodes, _SELECTION_SEED, "selection"),
             folder=run,
             verbose=options["verbose"],
         )
@@ -232,19 +263,20 @@ def _logger(
 
 
 def make_evaluate(
-    config: Mapping[str, Any], n_episodes: int, seed: int
+    config: Mapping[str, Any], n_episodes: int, seed: int, stream: str = "held_out"
 ) -> SceneEvaluator | VecEnvEvaluator:
-    """Make what evaluates a model on held-out episodes of its task.
+    """Make what evaluates a model on episodes of its task that no training plays.
 
     :param config: checked
     :param n_episodes: team episodes
-    :param seed: of the held-out stream
+    :param seed: of the stream
+    :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
     :return: a function of the model; to be closed
     """
     if config["env"] == AREA_SEARCH:
-        return SceneEvaluator(scene_of_run(config), n_episodes, seed)
+        return SceneEvaluator(scene_of_run(config), n_episodes, seed, stream=stream)
     env = make_env(config, min(_MAX_EVAL_TEAMS, n_episodes))
-    return VecEnvEvaluator(env, n_episodes, seed)
+    return VecEnvEvaluator(env, n_episodes, seed, stream=stream)
 
 
 def _evaluate(
@@ -252,13 +284,14 @@ def _evaluate(
 ) -> None:
     with closing(make_evaluate(config, n_episodes, _FINAL_SEED)) as evaluate:
         scores = evaluate(model)
-    write_yaml(run / "evaluation.yml", {"episodes": n_episodes, "scores": dict(scores)})
+    about = {"episodes": n_episodes, "stream": "held_out", "seed": _FINAL_SEED}
+    write_yaml(run / "evaluation.yml", {**about, "scores": dict(scores)})
     shown = ("explo_paper", "explo_true", "cover")
     if config["env"] == AREA_SEARCH:
         text = ", ".join(f"{name} {100 * scores[name]:.1f} %" for name in shown)
     else:
         text = ", ".join(f"{name} {value:.4g}" for name, value in scores.items())
-    print(f"{n_episodes} held-out episodes: {text}", flush=True)
+    print(f"{n_episodes} held-out episodes of seed {_FINAL_SEED}: {text}", flush=True)
 
 
 def _print_start(

@@ -70,15 +70,32 @@ def new_run(logs: Path, algo: str, env: str) -> Path:
             number += 1
 
 
+def _open_itself(path: Path) -> IO[str]:
+    """Open a file to read and append, and never the one that a link stands for.
+
+    A run folder may come from anybody, and a lock is emptied before its owner is written into it.
+
+    :raises UsageError: if the file is a link, or can not be opened
+    """
+    if path.is_symlink():
+        raise UsageError(f"{path}: is a symbolic link, where a lock must be a file: remove it")
+    # The flag, where the system has it, for a link that is made in between.
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
+    try:
+        return open(os.open(path, flags, 0o666), "a+", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror or error}") from None
+
+
 class RunLock:
     """Keeps two trainers from writing to one run; released by the system when its owner dies.
 
     :param run: the run folder
-    :raises UsageError: if another process has it
+    :raises UsageError: if another process has it, or the lock's file can not be opened
     """
 
     def __init__(self, run: Path) -> None:
-        self._file: IO[str] = open(run / LOCK_FILE, "a+", encoding="utf-8")  # noqa: SIM115
+        self._file: IO[str] = _open_itself(run / LOCK_FILE)
         try:
             import fcntl
         except ImportError:

@@ -12,13 +12,14 @@ _NOTES = {
     "explo_paper": "the paper's: newly seen cells / free cells, can exceed 100 %",
     "explo_true": "explored share of the free cells",
     "cover": "share of the targets covered",
+    "cover_bound": "share of the targets that no team can exceed",
     "time_e_paper": "first step with a mean explo_paper above 90 %",
     "t90_true": "first step with explo_true at 90 %",
     "t90_paper": "first step with explo_paper above 90 %",
     "path_length": "cells that a robot moved, mean over the team",
     "length": "steps of an episode",
 }
-_COLUMNS = ("explo_paper", "explo_true", "cover", "time_e_paper", "path_length")
+_COLUMNS = ("explo_paper", "explo_true", "cover", "cover_bound", "time_e_paper", "path_length")
 _INTERVALS = (
     "[95 % confidence interval]: Student's t over the episodes; time_e_paper: bootstrap percentiles"
 )
@@ -33,11 +34,11 @@ def report_of(records: EpisodeRecords) -> dict[str, Any]:
         the seed that it stands for; ``metrics``, see ``evaluation.metrics.summarize``;
         ``joint_steps``; and ``timing``, the only part that is not the same in every run
     """
-    from sb3_roles.evaluation.episodes import HELD_OUT
+    from sb3_roles.evaluation.episodes import stream_of
     from sb3_roles.evaluation.metrics import decision_time, summarize
 
     about, seed = records.metadata, records.metadata["seed"]
-    held_out = seed >= HELD_OUT
+    kind, number = stream_of(seed)
     joint_steps = int(records.length.sum())
     return {
         "config": {
@@ -50,8 +51,8 @@ def report_of(records: EpisodeRecords) -> dict[str, Any]:
             "episodes": len(records.episode),
             "first_episode": int(records.episode[0]),
             "scene": about["scene"],
-            "seed": seed - HELD_OUT if held_out else seed,
-            "stream": {"kind": "held_out" if held_out else "raw", "seed": seed},
+            "seed": number,
+            "stream": {"kind": kind, "seed": seed},
             "version": about["version"],
             "versions": about["versions"],
         },
@@ -141,9 +142,12 @@ def _choices(config: Mapping[str, Any]) -> list[str]:
 
 
 def _lines_of(rows: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
-    _, first = rows[0]
-    header = ["", *(f"{name}, {first[name]['unit']}" for name in _COLUMNS)]
-    return _aligned([header, *([name, *(_cell(each[c]) for c in _COLUMNS)] for name, each in rows)])
+    # Not every controller knows a bound, and differences have none.
+    units = {name: each[name]["unit"] for name in _COLUMNS for _, each in rows if name in each}
+    header = ["", *(f"{name}, {unit}" for name, unit in units.items())]
+    return _aligned(
+        [header, *([name, *(_cell(each.get(c)) for c in units)] for name, each in rows)]
+    )
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -161,8 +165,10 @@ def _value(metric: Mapping[str, Any]) -> str:
     return f"{metric['mean']:.2f}{error}{_interval(metric)} {metric['unit']}"
 
 
-def _cell(metric: Mapping[str, Any]) -> str:
-    return "-" if metric["mean"] is None else f"{metric['mean']:.2f}{_interval(metric)}"
+def _cell(metric: Mapping[str, Any] | None) -> str:
+    if metric is None or metric["mean"] is None:
+        return "-"
+    return f"{metric['mean']:.2f}{_interval(metric)}"
 
 
 def _interval(metric: Mapping[str, Any]) -> str:

@@ -116,7 +116,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action = parser.add_argument(*names, default=None, help=help, **options)
         default = DEFAULTS.get(action.dest)
         if default is not None and default is not False:
-            action.help = f"{help} (default: {default})"
+            own = (
+                f", {one.options[action.dest]} for {one.name}"
+                for one in ALGORITHMS.values()
+                if action.dest in one.options
+            )
+            action.help = f"{help} (default: {default}{''.join(own)})"
 
     add("--algo", type=one_of("algorithm", ALGORITHMS), metavar="NAME",
         help=f"one of {', '.join(ALGORITHMS)}")  # fmt: skip
@@ -214,14 +219,19 @@ def _options(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return all options: the given ones, those of a run's ``config.yml``, and the defaults."""
     file = given.get("conf_file")
     if file is None:
-        return {**DEFAULTS, **given}
+        return {**_defaults(given.get("algo", DEFAULTS["algo"])), **given}
     identity = load_identity(file)
     algo = identity.get("algo")
     if algo is not None and given.get("algo", algo) != algo:
         raise UsageError(f"{file} is of a run of {algo}: leave --algo {given['algo']} out")
     if "env" not in given and "env" in identity:
         check_named(file, identity["env"], None)
-    return {**DEFAULTS, **identity, **given}
+    options = {**identity, **given}
+    return {**_defaults(options.get("algo", DEFAULTS["algo"])), **options}
+
+
+def _defaults(algo: str) -> dict[str, Any]:
+    return {**DEFAULTS, **ALGORITHMS[algo].options}
 
 
 def _new_job(given: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
@@ -260,7 +270,8 @@ def _resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(stored, dict):
         raise ConfigError([f"{path / ARGS_FILE}: must be keys and values"])
     names = (*_STORED, "device", "num_threads")
-    options = {**DEFAULTS, **{name: stored.get(name, DEFAULTS[name]) for name in names}, **given}
+    defaults = _defaults(config["algo"])
+    options = {**defaults, **{name: stored.get(name, defaults[name]) for name in names}, **given}
     for name, (low, high) in _STORED_RANGES.items():
         value = options[name]
         whole = isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
