@@ -325,7 +325,7 @@ def test_interrupt_ends_quietly():
     process = subprocess.Popen(
         [*COMMAND, "simulate", "--episodes", "400000"],
         env=ENVIRONMENT,
-        # Jobs that a script starts in the background ignore the signal, and so would their children.
+        # A job in the background of a script ignores the signal, and so would its children.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
