@@ -93,7 +93,7 @@ class Demonstrations:
         if n_episodes > len(self):
             raise DemonstrationError(
                 f"there are {len(self)} demonstrated episodes, {n_episodes} are asked for: record "
-                "more of them, or use fewer"
+                "more of them, or lower n_demonstrations"
             )
         return Demonstrations(
             self.facts, *(getattr(self, name)[:n_episodes] for name in _ARRAYS if name != _FACTS)

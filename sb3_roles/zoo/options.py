@@ -28,11 +28,20 @@ class UsageError(ValueError):
     """A wrong command line that only the command itself can notice; the message is one line."""
 
 
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Adds the default to the help of an option, unless there is none or the text names it."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default is None or action.default is False or "default" in (action.help or ""):
+            return action.help
+        return super()._get_help_string(action)
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line with the closest match, and exit code 2."""
 
     def __init__(self, **options: Any) -> None:
-        options.setdefault("formatter_class", argparse.ArgumentDefaultsHelpFormatter)
+        options.setdefault("formatter_class", _Help)
         # An abbreviation that works today is ambiguous once another option is added.
         super().__init__(**options, allow_abbrev=False)
         self.set_defaults(parser=self)
