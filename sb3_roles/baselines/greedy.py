@@ -14,7 +14,8 @@ step, robot), so that an episode is the same in any batch.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
@@ -52,14 +53,8 @@ _TAG = np.uint64(0x4752454544592121)  # "GREEDY!!"
 _HALF = 32
 
 
-class GreedyController(ScriptedController):
-    """Every robot for itself: the nearest goal, then the next.
-
-    A robot picks the nearest frontier cell or known uncovered target, a target first on a tie, and
-    keeps it until it gets there or the goal is gone: a frontier cell that is none any more, a
-    target that a team mate covered. The cell on which it stands is no goal. Without any goal that
-    it can reach on the known map, it stays.
-    """
+class _Walker(ScriptedController):
+    """Calls a kernel that walks, with the teams' maps and what the controller keeps."""
 
     def begin(self, batch: BatchedAreaSearch) -> None:
         """Take the teams to control; all of them have just begun an episode.
@@ -67,18 +62,16 @@ class GreedyController(ScriptedController):
         :param batch: read only: positions, and what the team knows of its map
         """
         super().begin(batch)
-        robots, area = (batch.n_teams, batch.n_agents), batch.cells[0].size
         self._border = border_width(batch.scene.view_radius, batch.scene.sensor_radius)
-        self._memory = (
-            np.zeros(robots, np.int64),  # heading
-            np.full(robots, _NO_GOAL, np.int64),  # goal
-            np.zeros(robots, np.uint8),  # wanted
-        )
-        self._scratch = (
-            np.zeros(area, np.int32),  # distance
-            np.zeros(area, np.uint8),  # moves
-            np.zeros(area, np.int32),  # queue
-        )
+        self._arrays = self._allocate(batch.n_teams, batch.n_agents, batch.cells[0].size)
+
+    @abstractmethod
+    def _allocate(self, n_teams: int, n: int, area: int) -> tuple[np.ndarray, ...]:
+        """Return the kernel's memory and scratch; ``n`` robots a team, ``area`` padded cells."""
+
+    @abstractmethod
+    def _walk(self, *arguments: Any) -> None:
+        """Call the kernel."""
 
     def act(self, batch: BatchedAreaSearch) -> np.ndarray:
         """Take the first step to every robot's goal.
@@ -87,21 +80,43 @@ class GreedyController(ScriptedController):
         :return: int64 (n_teams, n_agents)
         """
         actions = np.empty((batch.n_teams, batch.n_agents), np.int64)
-        _walk_alone(
+        self._walk(
             batch.keys,
             batch.episodes,
             batch.steps,
             batch.cells,
             self._border,
             batch.position,
-            *self._memory,
-            *self._scratch,
+            *self._arrays,
             actions,
         )
         return actions
 
 
-class GreedyAssignedController(ScriptedController):
+class GreedyController(_Walker):
+    """Every robot for itself: the nearest goal, then the next.
+
+    A robot picks the nearest frontier cell or known uncovered target, a target first on a tie, and
+    keeps it until it gets there or the goal is gone: a frontier cell that is none any more, a
+    target that a team mate covered. The cell on which it stands is no goal. Without any goal that
+    it can reach on the known map, it stays.
+    """
+
+    def _allocate(self, n_teams: int, n: int, area: int) -> tuple[np.ndarray, ...]:
+        return (
+            np.zeros((n_teams, n), np.int64),  # heading
+            np.full((n_teams, n), _NO_GOAL, np.int64),  # goal
+            np.zeros((n_teams, n), np.uint8),  # wanted
+            np.zeros(area, np.int32),  # distance
+            np.zeros(area, np.uint8),  # moves
+            np.zeros(area, np.int32),  # queue
+        )
+
+    def _walk(self, *arguments: Any) -> None:
+        _walk_alone(*arguments)
+
+
+class GreedyAssignedController(_Walker):
     """The team shares its goals out one to one, anew at each step.
 
     Robots and goals are matched nearest pair first. A target counts as ``TARGET_LEAD`` cells nearer
@@ -110,16 +125,9 @@ class GreedyAssignedController(ScriptedController):
     goes to the one nearest to it, as a team mate does; without any that it can reach, it stays.
     """
 
-    def begin(self, batch: BatchedAreaSearch) -> None:
-        """Take the teams to control; all of them have just begun an episode.
-
-        :param batch: read only: positions, and what the team knows of its map
-        """
-        super().begin(batch)
-        n, area = batch.n_agents, batch.cells[0].size
-        self._border = border_width(batch.scene.view_radius, batch.scene.sensor_radius)
-        self._heading = np.zeros((batch.n_teams, n), np.int64)
-        self._scratch = (
+    def _allocate(self, n_teams: int, n: int, area: int) -> tuple[np.ndarray, ...]:
+        return (
+            np.zeros((n_teams, n), np.int64),  # heading
             np.zeros((n, area), np.int32),  # distance
             np.zeros((n, area), np.uint8),  # moves
             np.zeros((n, area), np.int32),  # queue
@@ -130,25 +138,8 @@ class GreedyAssignedController(ScriptedController):
             np.zeros(n, np.int64),  # chosen
         )
 
-    def act(self, batch: BatchedAreaSearch) -> np.ndarray:
-        """Share the goals out and take the first step to every robot's own.
-
-        :param batch: the teams
-        :return: int64 (n_teams, n_agents)
-        """
-        actions = np.empty((batch.n_teams, batch.n_agents), np.int64)
-        _walk_assigned(
-            batch.keys,
-            batch.episodes,
-            batch.steps,
-            batch.cells,
-            self._border,
-            batch.position,
-            self._heading,
-            *self._scratch,
-            actions,
-        )
-        return actions
+    def _walk(self, *arguments: Any) -> None:
+        _walk_assigned(*arguments)
 
 
 @njit(cache=True)

@@ -24,6 +24,8 @@ import safetensors.numpy
 import safetensors.torch
 import torch as th
 
+from sb3_roles.common.names import one_line
+
 FORMAT = "sb3_roles checkpoint"
 FORMAT_VERSION = 1
 SUFFIX = ".ckpt"
@@ -235,7 +237,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         NotImplementedError,
         RuntimeError,
     ) as error:
-        message = " ".join(str(error).split())
+        message = one_line(error)
         raise CheckpointError(f"{path}: damaged checkpoint: {message}") from error
 
 

@@ -17,3 +17,8 @@ def closest(what: str, name: object, allowed: Iterable[str]) -> str:
     close = difflib.get_close_matches(str(name), known, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"unknown {what} {name!r}: allowed are {', '.join(known) or 'none'}{hint}"
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, for the end of a message of one line."""
+    return " ".join(str(error).split())

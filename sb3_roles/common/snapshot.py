@@ -208,19 +208,37 @@ def load_weights(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
     :param checkpoint: read from a file
     :raises CheckpointError: if a name, shape or dtype is another one; nothing is changed then
     """
-    own = model.policy.state_dict()
-    odd = sorted(set(own) ^ set(checkpoint.policy))
-    if odd:
-        raise CheckpointError(f"the weights do not fit the configuration: {odd[0]} is in one only")
-    for name, tensor in own.items():
-        _check_like(f"weights {name}", checkpoint.policy[name], tensor)
+    check_weights(checkpoint.policy, model.policy.state_dict())
     model.policy.load_state_dict(checkpoint.policy)
 
 
-def _check_like(what: str, given: th.Tensor, wanted: th.Tensor) -> None:
+def check_weights(
+    given: Mapping[str, th.Tensor],
+    own: Mapping[str, th.Tensor],
+    what: str = "weights",
+    owner: str = "configuration",
+) -> None:
+    """Refuse weights that are not those of a policy, by name, shape and dtype.
+
+    :param given: of a file
+    :param own: of the policy
+    :param what: what the message calls the former
+    :param owner: what they should fit
+    :raises CheckpointError: if a name, shape or dtype is another one
+    """
+    odd = sorted(set(own) ^ set(given))
+    if odd:
+        raise CheckpointError(f"the {what} do not fit the {owner}: {odd[0]} is in one only")
+    for name, tensor in own.items():
+        _check_like(f"{what} {name}", given[name], tensor, owner)
+
+
+def _check_like(
+    what: str, given: th.Tensor, wanted: th.Tensor, owner: str = "configuration"
+) -> None:
     if given.shape != wanted.shape or given.dtype != wanted.dtype:
         raise CheckpointError(
-            f"the {what} do not fit the configuration: {given.dtype} {tuple(given.shape)}, "
+            f"the {what} do not fit the {owner}: {given.dtype} {tuple(given.shape)}, "
             f"expected {wanted.dtype} {tuple(wanted.shape)}"
         )
 

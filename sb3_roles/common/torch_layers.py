@@ -311,19 +311,23 @@ class GoalPrior(nn.Module):
     """Logits that favor the moves towards sub-goals, with a learned weight for each sub-goal.
 
     :param weights: first weights, float (n_goals,), or (n_roles, n_goals) if they differ by role
+    :param n_moves: number of moves
     """
 
-    def __init__(self, weights: th.Tensor) -> None:
+    def __init__(self, weights: th.Tensor, n_moves: int) -> None:
         super().__init__()
         self.weights = nn.Parameter(weights)
+        self.n_moves = n_moves
 
-    def forward(self, flags: th.Tensor, roles: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, goals: th.Tensor, roles: th.Tensor | None = None) -> th.Tensor:
         """Weigh the moves.
 
-        :param flags: float (n, n_goals, n_moves), 1 for a move with which a shortest path begins
+        :param goals: (n, n_goals, n_moves or more), rows that begin with a flag for each move, 1
+            for one with which a shortest path begins
         :param roles: int64 (n,), if the weights differ by role; None for all roles
         :return: float (n, n_moves), or (n, n_roles, n_moves)
         """
+        flags = goals[..., : self.n_moves].float()
         if self.weights.ndim == 1 or roles is None:
             return th.einsum("...g,ngm->n...m", self.weights, flags)
         one_hot = F.one_hot(roles, len(self.weights)).to(flags.dtype)

@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from area_search.scenes import Scene, get_scene
+from sb3_roles.baselines.area import area_scene
 from sb3_roles.common.callbacks import Evaluate
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.common.thresholds import first_above
@@ -151,19 +152,6 @@ class VecEnvEvaluator:
     def close(self) -> None:
         """Release the environment."""
         self.env.close()
-
-
-def area_scene(env: VecEnv | None) -> Scene | None:
-    """Return the scene of an area-search environment, below any wrappers; None of another one.
-
-    :param env: a vectorized environment of teams
-    :raises ValueError: if its rows are not those of a ``TeamVecEnv``
-    """
-    try:
-        scene = find_team_env(env).get_attr("scene", [0])[0]
-    except AttributeError:
-        return None
-    return scene if isinstance(scene, Scene) else None
 
 
 def make_evaluator(

@@ -41,6 +41,7 @@ import numpy as np
 
 from area_search import kernels
 from sb3_roles.common.files import write_atomically
+from sb3_roles.common.names import one_line
 from sb3_roles.evaluation.header import checked_scene
 
 if TYPE_CHECKING:
@@ -237,7 +238,7 @@ def read_records(path: str | Path) -> EpisodeRecords:
     except (OSError, pa.ArrowException) as error:
         if isinstance(error, OSError) and error.strerror:
             raise RecordsError(f"{path}: {error.strerror}") from None
-        raise RecordsError(f"{path}: damaged, or no Parquet file: {_one_line(error)}") from error
+        raise RecordsError(f"{path}: damaged, or no Parquet file: {_short_line(error)}") from error
     text = (table.schema.metadata or {}).get(_KEY)
     if text is None:
         raise RecordsError(f"{path}: a Parquet file, but not one of episode records")
@@ -256,15 +257,15 @@ def read_records(path: str | Path) -> EpisodeRecords:
     except RecordsError:
         raise
     except (LookupError, TypeError, ValueError, RecursionError, pa.ArrowException) as error:
-        raise RecordsError(f"{path}: damaged records: {_one_line(error)}") from error
+        raise RecordsError(f"{path}: damaged records: {_short_line(error)}") from error
 
 
 def _no_number(name: str) -> None:
     raise ValueError(f"the metadata hold {name}, which is no JSON")
 
 
-def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
+def _short_line(error: Exception) -> str:
+    text = one_line(error)
     return text if len(text) <= 200 else f"{text[:197]}..."
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from area_search.cells import JOINT_CHANNELS, KNOWN_CHANNELS, N_ACTIONS
 from area_search.kernels import METRICS
 from sb3_roles.common.files import write_atomically
+from sb3_roles.common.names import one_line
 from sb3_roles.common.policies import POSITION_KEY
 from sb3_roles.common.team_wrapper import AGENT_KEY
 
@@ -38,11 +39,6 @@ _ARRAYS: dict[str, tuple[type, int]] = {
 
 class DemonstrationError(ValueError):
     """A file that holds no demonstrations, or others than were asked for; a single line."""
-
-
-def one_line(error: BaseException) -> str:
-    """Return what an error says, for the end of a message of one line."""
-    return " ".join(str(error).split())
 
 
 @dataclass(frozen=True, eq=False)

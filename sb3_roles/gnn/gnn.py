@@ -15,16 +15,17 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import obs_as_tensor, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_roles.baselines.area import area_scene
 from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
 from sb3_roles.common.distributions import LOG_ZERO
+from sb3_roles.common.names import one_line
 from sb3_roles.common.policies import TeamPolicy
-from sb3_roles.gnn.demonstrations import DemonstrationError, one_line
+from sb3_roles.gnn.demonstrations import DemonstrationError
 from sb3_roles.gnn.joint_steps import JointSteps, batches, moved
 from sb3_roles.gnn.policies import GNNPolicy
 from sb3_roles.gnn.source import (
     check_recording,
     describe,
-    environment_scene,
     obtain,
     summary,
     validation_episodes,
@@ -150,7 +151,7 @@ class GNN(MAPPO):
         """
         if self.demonstrations is None:
             validation_episodes(self.n_demonstrations, self.validation_share)
-            check_recording(self.controller, environment_scene(self.env))
+            check_recording(self.controller, area_scene(self.env))
         else:
             self.data()
 
@@ -172,7 +173,7 @@ class GNN(MAPPO):
             found = obtain(
                 self.demonstrations,
                 self.controller,
-                environment_scene(self.env),
+                area_scene(self.env),
                 self.n_demonstrations,
                 self.seed or 0,
                 None if folder is None else Path(folder) / DEMONSTRATIONS_FILE,
@@ -193,7 +194,7 @@ class GNN(MAPPO):
         :raises ValueError: see :meth:`data`
         """
         self.data()
-        return summary(self.facts, environment_scene(self.env))
+        return summary(self.facts, area_scene(self.env))
 
     def _report(self, count: int) -> None:
         if self.verbose:

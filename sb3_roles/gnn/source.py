@@ -7,27 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecEnv
-
 from area_search.kernels import METRICS
 from area_search.scenes import Scene
 from sb3_roles.baselines import controller_class
-from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.gnn.demonstrations import Demonstrations, load_demonstrations
 from sb3_roles.gnn.recording import record
-
-
-def environment_scene(env: VecEnv | None) -> Scene | None:
-    """Return the scene of an environment of area search.
-
-    :param env: an environment of ``make_team_vec_env``, possibly wrapped
-    :return: None for another one
-    """
-    try:
-        scene = find_team_env(env).get_attr("scene", [0])[0]
-    except AttributeError:
-        return None
-    return scene if isinstance(scene, Scene) else None
 
 
 def validation_episodes(n_episodes: int, share: float) -> int:

@@ -10,7 +10,8 @@ import numpy as np
 import torch as th
 
 from sb3_roles.common.checkpoint import CheckpointError
-from sb3_roles.gnn.demonstrations import one_line
+from sb3_roles.common.names import one_line
+from sb3_roles.common.snapshot import check_weights
 
 
 @dataclass
@@ -68,24 +69,9 @@ def read_state(
             f"{len(weights)} best weights"
         )
     if weights:
-        weights = _fitting(weights, own)
+        check_weights(weights, own, "best weights", "policy")
+        weights = {name: given.to(own[name].device) for name, given in weights.items()}
     return CloningState(epochs, best_epoch, best_loss, weights), facts
-
-
-def _fitting(
-    weights: Mapping[str, th.Tensor], own: Mapping[str, th.Tensor]
-) -> dict[str, th.Tensor]:
-    odd = sorted(set(own) ^ set(weights))
-    if odd:
-        raise CheckpointError(f"the best weights do not fit the policy: {odd[0]} is in one only")
-    for name, tensor in own.items():
-        given = weights[name]
-        if given.shape != tensor.shape or given.dtype != tensor.dtype:
-            raise CheckpointError(
-                f"the best weights {name} do not fit the policy: {given.dtype} "
-                f"{tuple(given.shape)}, expected {tensor.dtype} {tuple(tensor.shape)}"
-            )
-    return {name: given.to(own[name].device) for name, given in weights.items()}
 
 
 def check_same_demonstrations(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

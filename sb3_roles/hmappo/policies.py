@@ -155,7 +155,8 @@ class RoleActorCriticPolicy(TeamPolicy):
                 f"roles, got {n_goals} rows"
             )
         own = th.eye(self.n_roles)
-        return GoalPrior(own * self.goal_prior + (1.0 - own) * self.other_goal_prior)
+        weights = own * self.goal_prior + (1.0 - own) * self.other_goal_prior
+        return GoalPrior(weights, self.n_moves)
 
     def _move_log_probs(
         self, own: th.Tensor, roles: th.Tensor | None, obs: Observation
@@ -163,8 +164,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         """Return log p(move | role), (n, n_moves) for given roles or (n, n_roles, n_moves)."""
         logits = self.action_net(own, roles).float()
         if self.goal_net is not None:
-            flags = obs[self.goal_key][:, :, : self.n_moves]  # type: ignore[index]
-            logits = logits + self.goal_net(flags.float(), roles)
+            logits = logits + self.goal_net(obs[self.goal_key], roles)  # type: ignore[index]
         return F.log_softmax(logits, dim=-1)
 
     def _with_role(self, features: th.Tensor, obs: Observation) -> th.Tensor:

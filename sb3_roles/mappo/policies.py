@@ -75,7 +75,9 @@ class TeamActorCriticPolicy(TeamPolicy):
         n_moves = int(self.action_space.n)
         self.action_net = Head(size, self.head_arch, n_moves, gain=0.01)
         n_goals = self._count_goals(self.goal_key, n_moves)
-        self.goal_net = GoalPrior(th.full((n_goals,), self.goal_prior)) if n_goals else None
+        self.goal_net = (
+            GoalPrior(th.full((n_goals,), self.goal_prior), n_moves) if n_goals else None
+        )
         size = self._add_encoders("value_primitive", self.critic_keys)
         self.value_net = Head(size, self.value_arch, 1, gain=1.0)  # type: ignore[assignment]
         self.action_dist = CategoricalDistribution(n_moves)
@@ -89,8 +91,7 @@ class TeamActorCriticPolicy(TeamPolicy):
             features = self.actor_graph(teams, graph).flatten(0, 1)
         logits = self.action_net(features).float()
         if self.goal_net is not None:
-            flags = obs[self.goal_key][:, :, : logits.shape[1]]  # type: ignore[index]
-            logits = logits + self.goal_net(flags.float())
+            logits = logits + self.goal_net(obs[self.goal_key])  # type: ignore[index]
         return F.log_softmax(logits, dim=1)
 
     def _values(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:

@@ -6,7 +6,7 @@ Importing this module imports no torch: a wrong configuration is refused before 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any
 
@@ -260,6 +260,14 @@ def _with_schedule(value: Any) -> Any:
     return LinearSchedule(start, 0.0, 1.0)
 
 
+_MAPPO_ALGORITHM = Algorithm(
+    "mappo",
+    "sb3_roles.mappo:MAPPO",
+    "team",
+    {"TeamPolicy": "sb3_roles.mappo.policies:TeamActorCriticPolicy"},
+    _MAPPO,
+    batch_in_rows=False,
+)
 ALGORITHMS: dict[str, Algorithm] = {
     algorithm.name: algorithm
     for algorithm in (
@@ -279,23 +287,9 @@ ALGORITHMS: dict[str, Algorithm] = {
             },
             batch_in_rows=False,
         ),
-        Algorithm(
-            "mappo",
-            "sb3_roles.mappo:MAPPO",
-            "team",
-            {"TeamPolicy": "sb3_roles.mappo.policies:TeamActorCriticPolicy"},
-            _MAPPO,
-            batch_in_rows=False,
-        ),
+        _MAPPO_ALGORITHM,
         # Blumenkamp and Prorok's policy is MAPPO's with the networks of its configuration.
-        Algorithm(
-            "ecc",
-            "sb3_roles.mappo:MAPPO",
-            "team",
-            {"TeamPolicy": "sb3_roles.mappo.policies:TeamActorCriticPolicy"},
-            _MAPPO,
-            batch_in_rows=False,
-        ),
+        replace(_MAPPO_ALGORITHM, name="ecc"),
         Algorithm(
             "gnn",
             "sb3_roles.gnn:GNN",
@@ -319,13 +313,10 @@ ALGORITHMS: dict[str, Algorithm] = {
             # Five epochs of its configuration: joint steps are few where playing teaches nothing.
             options={"eval_freq": 1000, "save_freq": 1000},
         ),
-        Algorithm(
-            "h2gnn",
-            "sb3_roles.mappo:MAPPO",
-            "team",
-            {"H2GNNPolicy": "sb3_roles.gnn.policies:H2GNNPolicy"},
-            _MAPPO,
-            batch_in_rows=False,
+        replace(
+            _MAPPO_ALGORITHM,
+            name="h2gnn",
+            policies={"H2GNNPolicy": "sb3_roles.gnn.policies:H2GNNPolicy"},
         ),
         Algorithm("ppo", "stable_baselines3:PPO", "role", _ROLE_POLICY, _PPO, _TEAM_BUFFER),
         Algorithm(

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 from sb3_roles.baselines import CONTROLLER_NAMES, controller_class
 from sb3_roles.common.names import closest
-from sb3_roles.zoo.config import read_run_config
 from sb3_roles.zoo.enjoy import add_play_options, load_run
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import (
@@ -193,10 +192,7 @@ def make_controllers(args: Namespace, names: Sequence[str]) -> dict[str, Control
             except ImportError as error:
                 raise UsageError(f"{name}: {error}") from error
         else:
-            env = read_run_config(Path(name))["env"]
-            if env != AREA_SEARCH:
-                raise UsageError(f"{name}: its environment is {env}; evaluate plays {AREA_SEARCH}")
-            loaded = load_run(Path(name), args.load_best, args.device)
+            loaded = load_run(Path(name), args.load_best, args.device, AREA_SEARCH)
             made[name] = loaded.controller(not args.stochastic, not args.no_communication)
     return made
 

@@ -24,6 +24,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_roles.common import snapshot
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+from sb3_roles.common.names import one_line
 from sb3_roles.common.progress_callback import TeamProgressBar
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.evaluation.callback import EvaluationCallback
@@ -87,7 +88,7 @@ def _ask(config: Mapping[str, Any], question: Callable[[], object]) -> None:
     try:
         question()
     except (ValueError, ImportError) as error:
-        raise UsageError(f"{config['algo']}: {' '.join(str(error).split())}") from error
+        raise UsageError(f"{config['algo']}: {one_line(error)}") from error
 
 
 def _get_demonstrations(run: Path, model: Any, job: Mapping[str, Any]) -> None:
@@ -179,12 +180,12 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
             # Losses, rewards and observations that are not finite, teams that fall apart.
             if options["verbose"] > 1:
                 raise
-            raise TrainingFailed(f"{run}: {' '.join(str(error).split())}") from error
+            raise TrainingFailed(f"{run}: {one_line(error)}") from error
         except RuntimeError as error:
             # Torch's way to say so, on a CPU and on a GPU.
             if "memory" not in str(error):
                 raise
-            raise MemoryError(" ".join(str(error).split())) from error
+            raise MemoryError(one_line(error)) from error
     steps = model.num_timesteps // find_team_env(model.env).n_agents
     print(f"{run}: {steps} joint steps; checkpoints: {len(checkpoints.paths())}", flush=True)
     if stop.received is not None:
