@@ -105,8 +105,8 @@ def _named(what: str, content: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _fields(
-    where: str, content: object, checks: Mapping[str, Check], required: Iterable[str] | None = None
-) -> dict[str, Any]:
+    where: str, content: object, checks: Mapping[Any, Check], required: Iterable[Any] | None = None
+) -> dict[Any, Any]:
     if not isinstance(content, dict):
         raise PlanError(f"{where} must be keys and values, got {type(content).__name__}")
     for key, value in content.items():
