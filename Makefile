@@ -6,11 +6,13 @@ VENV ?= .venv
 TORCH ?= torch==2.13.0
 # Joint steps of `make train`.
 STEPS ?= 400000
+# Further options of `make tables` and `make report`: TABLES=--quick takes minutes.
+TABLES ?=
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install test check lint type format train enjoy bench clean
+.PHONY: help install test check lint type format train enjoy tables report bench clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -21,7 +23,7 @@ $(STAMP): setup.cfg pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --upgrade pip
 	$(BIN)/python -m pip install -qq "$(TORCH)"
-	$(BIN)/python -m pip install -qq --editable ".[test,dev,plots,video,tensorboard,vrp]"
+	$(BIN)/python -m pip install -qq --editable ".[test,dev,plots,video,tensorboard,vrp,ray,browser]"
 	touch $@
 
 test: $(STAMP) ## run the tests
@@ -33,6 +35,12 @@ train: $(STAMP) ## train HMAPPO on the hard scene, evaluate it, draw one episode
 
 enjoy: $(STAMP) ## play one episode of the latest run in a window
 	$(BIN)/python enjoy.py --algo hmappo --env area-search-v0 -f logs
+
+tables: $(STAMP) ## play what is missing, write the paper's tables and figures to results/
+	$(BIN)/sb3-roles tables $(TABLES)
+
+report: $(STAMP) ## the same, and results/report.html
+	$(BIN)/sb3-roles report $(TABLES)
 
 check: lint type ## run the linters and the type checker
 

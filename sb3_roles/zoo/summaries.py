@@ -176,11 +176,4 @@ def _interval(metric: Mapping[str, Any]) -> str:
 
 
 def _decision(times: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {_duration(times[name])}" for name in ("median", "mean", "p95"))
-
-
-def _duration(seconds: float) -> str:
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-6:.3g} µs"
+    return ", ".join(f"{name} {duration(times[name])}" for name in ("median", "mean", "p95"))

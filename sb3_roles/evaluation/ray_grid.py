@@ -1,0 +1,126 @@
+"""Play the blocks of a grid on a Ray cluster; only this module imports Ray (extra ``ray``)."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+# Read when Ray is imported: it tells nobody that it is used.
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
+import ray
+from ray.exceptions import RayError as _RayError
+
+from sb3_roles.common.names import one_line
+from sb3_roles.evaluation.crews import (
+    Controllers,
+    Finished,
+    Make,
+    Task,
+    keep,
+    play_block,
+)
+from sb3_roles.evaluation.records import EpisodeRecords
+from sb3_roles.evaluation.store import RecordStore
+
+LOCAL = "local"
+# Losses of a worker or of its machine; errors of a controller are no reason to try again.
+MAX_RETRIES = 5
+# Records and weights are small; Ray would take a third of the memory.
+_OBJECT_STORE_BYTES = 100_000_000
+_SECONDS_TO_CONNECT = 10.0
+
+
+class RayError(RuntimeError):
+    """No cluster could be reached or started; one line."""
+
+
+class RayCrew:
+    """Ray's workers play; the records come back here, where they are kept.
+
+    Workers need no disk in common with this process, and no runs: the weights are sent to them.
+    They need this package, of the same version.
+
+    :param address: of a running cluster, ``HOST:PORT`` or ``"auto"``, or ``"local"`` to start one
+    :param make: see ``Make``
+    :param store: where blocks are kept
+    :param n_cpus: workers of a local cluster
+    :raises RayError: if there is no such cluster
+    """
+
+    def __init__(self, address: str, make: Make, store: RecordStore, n_cpus: int = 1) -> None:
+        _check_address(address)
+        own: dict[str, Any] = {}
+        if address == LOCAL:
+            own = {"num_cpus": n_cpus, "include_dashboard": False}
+            own["object_store_memory"] = _OBJECT_STORE_BYTES
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+        except (ConnectionError, ValueError, RuntimeError, OSError) as error:
+            raise RayError(f"{address}: no Ray cluster: {one_line(error)[:200]}") from None
+        self._make, self._store = make, store
+        self._running: dict[Any, Task] = {}
+        self._files: dict[Any, Any] = {}
+        self._play = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_play)
+
+    @property
+    def size(self) -> int:
+        """CPUs of the cluster, which may come and go."""
+        return max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a worker may soon have nothing to do."""
+        return len(self._running) < 2 * self.size
+
+    def submit(self, task: Task) -> None:
+        """Send a task; the files of its parcel are sent once."""
+        key = task.parcel.key
+        if key not in self._files:
+            self._files[key] = ray.put(dict(task.parcel.files))
+        light = task._replace(parcel=replace(task.parcel, files={}))
+        self._running[self._play.remote(light, self._files[key], self._make)] = task
+
+    def wait(self) -> Finished:
+        """Wait for the next block, and keep it."""
+        (done,), _ = ray.wait(list(self._running), num_returns=1)
+        task = self._running.pop(done)
+        try:
+            records, error = ray.get(done)
+        except _RayError as failure:
+            return Finished(task, error=f"Ray: {one_line(failure)[:200]}")
+        return keep(Finished(task, records, error), self._store)
+
+    def close(self) -> None:
+        """Leave the cluster, which ends what it still plays, and stop it if it was started here."""
+        ray.shutdown()
+
+
+def _check_address(address: str) -> None:
+    """Find out whether anybody listens: Ray would try for minutes."""
+    if address in (LOCAL, "auto"):
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdecimal()):
+        raise RayError(f"must be {LOCAL}, auto or HOST:PORT, got {address!r}")
+    try:
+        socket.create_connection((host, int(port)), _SECONDS_TO_CONNECT).close()
+    except (OSError, OverflowError) as error:
+        raise RayError(f"{address}: no Ray cluster: {one_line(error)}") from None
+
+
+@lru_cache(maxsize=1)
+def _controllers(make: Make) -> Controllers:
+    return Controllers(make)
+
+
+def _play(task: Task, files: Mapping[str, bytes], make: Make) -> tuple[EpisodeRecords | None, str]:
+    """Play a block in a worker of Ray, which is used for one task after the other."""
+    task = task._replace(parcel=replace(task.parcel, files=files))
+    finished = play_block(task, _controllers(make))
+    return finished.records, finished.error

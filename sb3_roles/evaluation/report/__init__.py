@@ -1,0 +1,1 @@
+"""The report: one HTML page with tables, figures, an episode player and what differs from print."""

@@ -1,0 +1,100 @@
+"""Who plays for the rows of a plan: scripted controllers, and the runs of ``train``."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sb3_roles.common.names import closest
+from sb3_roles.evaluation.entrants import Entrant
+from sb3_roles.zoo.config import CONFIG_FILE
+from sb3_roles.zoo.environments import AREA_SEARCH
+from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.row_runs import (
+    Report,
+    RunFinder,
+    describe_runs,
+    named_runs,
+    newest_checkpoint,
+    training_command,
+)
+from sb3_roles.zoo.run_folder import CHECKPOINTS
+
+if TYPE_CHECKING:
+    from sb3_roles.baselines.base import Controller
+    from sb3_roles.evaluation.plan import Figure, Plan, Table
+
+
+def make_controller(entrant: Entrant) -> Controller:
+    """Make who plays for an entrant; of a run, the latest weights, on the CPU.
+
+    :param entrant: see ``Entrant``
+    :raises ImportError: if a scripted controller needs a package that is missing
+    :raises UsageError: if the folder is no run on area search, or damaged
+    """
+    if not entrant.learned:
+        from sb3_roles.baselines import controller_class
+
+        return controller_class(entrant.source)()
+    from sb3_roles.zoo.enjoy import load_run
+
+    loaded = load_run(Path(entrant.source), device="cpu", env=AREA_SEARCH)
+    return loaded.controller(deterministic=not entrant.drawn, communicate=True)
+
+
+def run_files(entrant: Entrant) -> dict[str, bytes]:
+    """Read what :func:`make_controller` needs of a run folder.
+
+    :param entrant: a learned one
+    :return: path within the folder -> content; the checkpoint holds the weights alone
+    :raises UsageError: if there is no sound checkpoint
+    :raises OSError: if a file can not be read
+    """
+    from sb3_roles.common.checkpoint import write_checkpoint
+
+    run = Path(entrant.source)
+    path, checkpoint = newest_checkpoint(run)
+    steps = {key: checkpoint.manifest.get(key, 0) for key in ("env_steps", "agent_steps")}
+    with tempfile.TemporaryDirectory(prefix="sb3_roles-") as folder:
+        weights = Path(folder, path.name)
+        write_checkpoint(weights, steps, checkpoint.policy)
+        content = weights.read_bytes()
+    return {
+        CONFIG_FILE: (run / CONFIG_FILE).read_bytes(),
+        f"{CHECKPOINTS}/{path.name}": content,
+    }
+
+
+def find_entrants(
+    plan: Plan, logs: Path, runs: Sequence[str] = (), report: Report = print
+) -> dict[str, list[Entrant]]:
+    """Find who plays for the rows that tables and figures need.
+
+    :param plan: the part of it that is wanted
+    :param logs: folder of the runs
+    :param runs: see :func:`named_runs`
+    :param report: takes lines: the runs of each learned row, or how to train some
+    :return: row -> one entrant for each run, one for a scripted row; empty for a row without a run
+    :raises UsageError: if ``runs`` or the configuration of a row is wrong
+    """
+    named = named_runs(runs, plan)
+    finder = RunFinder(logs, report)
+    parts: list[Table | Figure] = [*plan.tables.values(), *plan.figures.values()]
+    entrants: dict[str, list[Entrant]] = {}
+    for name in dict.fromkeys(row for part in parts for row in part.rows):
+        row = plan.rows[name]
+        if row.controller is not None:
+            entrants[name] = [Entrant(name, row.controller)]
+            continue
+        if name in named:
+            report(f"{name}: {describe_runs(named[name])}")
+        chosen = named[name] if name in named else finder.find(row)
+        if not chosen:
+            report(f"{name} has no run in {logs}: {training_command(row, logs)}")
+        entrants[name] = [run.entrant(row) for run in chosen]
+    unneeded = [name for name in named if name not in entrants]
+    if unneeded:
+        raise UsageError(f"argument --runs: {closest('row', unneeded[0], entrants)}")
+    return entrants

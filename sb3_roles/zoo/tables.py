@@ -1,0 +1,268 @@
+"""``sb3-roles tables`` and ``sb3-roles report``: tables and figures, beside those of the paper."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_roles.zoo.config import config_file, read_yaml
+from sb3_roles.zoo.options import UsageError, whole_number
+
+if TYPE_CHECKING:
+    from sb3_roles.evaluation.crews import Crew
+    from sb3_roles.evaluation.grid import Survey
+    from sb3_roles.evaluation.plan import Plan
+    from sb3_roles.evaluation.store import RecordStore
+    from sb3_roles.zoo.options import Parser, Subparsers
+    from sb3_roles.zoo.table_outputs import Made
+
+EXIT_ROWS_FAILED = 3
+RECORDS, PAGE, LOCAL = "records", "report.html", "local"
+_ABOUT = (
+    "What was played once is kept in records, and only what is missing is played: a command that "
+    "was interrupted goes on where it was. Learned rows are the runs of --log-folder with the "
+    f"configuration of the row. Exit code {EXIT_ROWS_FAILED}: a row failed and is left out."
+)
+
+
+def names_of(text: str) -> list[str]:
+    """Read names with commas between."""
+    return [name.strip() for name in text.split(",")]
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the two commands."""
+    tables = subparsers.add_parser(
+        "tables",
+        help="the tables and figures of the paper",
+        description="Play what the tables and figures of a plan need, and write them as Markdown, "
+        f"LaTeX, CSV and images. {_ABOUT}",
+    )
+    add_options(tables)
+    tables.set_defaults(run=run)
+    report = subparsers.add_parser(
+        "report",
+        help="tables, figures and episodes as one HTML page",
+        description=f"What tables does, and {PAGE}, a page to look at all of it. {_ABOUT}",
+    )
+    add_options(report)
+    report.set_defaults(run=run_report)
+
+
+def add_options(parser: Parser) -> None:
+    """Add the options that the two commands share."""
+    for what, some in (
+        ("tables", "I,II"),
+        ("rows", "random,hmappo"),
+        ("scenes", "easy,hard"),
+        ("figures", "training,time_e"),
+    ):
+        parser.add_argument(
+            f"--{what}",
+            type=names_of,
+            action="extend",
+            metavar="NAMES",
+            help=f"only these, such as {some}; figures are left out where others are named only"
+            if what == "figures"
+            else f"only these, such as {some}",
+        )
+    parser.add_argument(
+        "--episodes",
+        type=whole_number(1, 10**6),
+        metavar="N",
+        help="of each row and column, instead of the plan's; rows with a limit keep it",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few episodes: minutes, and said in every caption"
+    )
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument(
+        "--jobs",
+        type=whole_number(1, 1024),
+        metavar="N",
+        help="processes that play (default: one for each CPU)",
+    )
+    who.add_argument(
+        "--ray",
+        metavar="ADDRESS",
+        help=f"play on a Ray cluster: its address, or {LOCAL!r} to start one here (extra ray)",
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path("results"), metavar="DIR", help="of all that is made"
+    )
+    parser.add_argument(
+        "-f", "--log-folder", type=Path, default=Path("logs"), metavar="DIR", help="of the runs"
+    )
+    parser.add_argument(
+        "--runs",
+        action="append",
+        default=[],
+        metavar="ROW=RUN",
+        help="runs of a learned row, whatever their configuration: a run folder or a pattern; may "
+        "be repeated",
+    )
+    parser.add_argument(
+        "--plan", type=Path, metavar="FILE", help="instead of zoo_configs/tables.yml"
+    )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="only say what is there and what is missing"
+    )
+
+
+def n_cpus() -> int:
+    """Return how many CPUs this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def run(args: Namespace) -> int:
+    """Play, and write tables and figures.
+
+    :param args: parsed arguments
+    :return: exit code: 0, or 3 if a row failed and was left out
+    :raises UsageError: if a name, a plan or a run is wrong, before anything is played
+    :raises OSError: if something can not be written
+    """
+    made = make(args)
+    if made is None:
+        return 0
+    if len(made.tables) == 1:
+        from sb3_roles.evaluation.table_writers import to_markdown
+
+        print(f"\n{to_markdown(made.tables)}", end="")
+    return made.code
+
+
+def run_report(args: Namespace) -> int:
+    """Do what :func:`run` does, and write the page.
+
+    :param args: parsed arguments
+    :return: as of :func:`run`
+    """
+    made = make(args)
+    if made is None:
+        return 0
+    from sb3_roles.zoo.table_outputs import write_page
+
+    write_page(args, made)
+    return made.code
+
+
+def read_plan(args: Namespace) -> Plan:
+    """Read the part of a plan that the command line asks for.
+
+    :param args: parsed arguments
+    :raises UsageError: if the file or a name is wrong
+    """
+    from sb3_roles.evaluation.plan import PlanError
+    from sb3_roles.evaluation.plan_file import parse_plan
+
+    file = config_file("tables") if args.plan is None else args.plan
+    try:
+        plan = parse_plan(read_yaml(file))
+    except PlanError as error:
+        raise UsageError(f"{file}: {error}") from None
+    try:
+        return plan.select(args.tables, args.rows, args.scenes, args.figures)
+    except PlanError as error:
+        raise UsageError(str(error)) from None
+
+
+def make(args: Namespace) -> Made | None:
+    """Play what is missing, and write tables and figures.
+
+    :param args: parsed arguments
+    :return: None for ``--dry-run``, which prints what there is
+    """
+    started, jobs = time.time(), args.jobs or n_cpus()
+    plan = read_plan(args)
+    if args.figures and find_spec("matplotlib") is None:
+        raise UsageError("argument --figures: install sb3_roles[plots] to draw them")
+    if not args.dry_run:
+        args.out.mkdir(parents=True, exist_ok=True)
+        if not os.access(args.out, os.W_OK):
+            raise UsageError(f"argument --out: {str(args.out)!r} can not be written")
+    # Read when they are imported: a job is one thread.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from sb3_roles.evaluation.grid import Survey, play
+    from sb3_roles.evaluation.store import RecordStore
+    from sb3_roles.zoo.entrants import find_entrants, make_controller, run_files
+    from sb3_roles.zoo.table_outputs import write_all
+
+    entrants = find_entrants(plan, args.log_folder, args.runs, _tell)
+    store = RecordStore(args.out / RECORDS, _tell, set_aside=not args.dry_run)
+    options: dict[str, Any] = {
+        "files": run_files,
+        "quick": args.quick,
+        "episodes": args.episodes,
+        "report": _tell,
+    }
+    if args.dry_run:
+        survey = Survey(plan, entrants, store, make_controller, **options)
+        print("\n".join(_lines_of(survey, jobs)))
+        return None
+    try:
+        with _crew(args, store) as crew:
+            bar = sys.stderr.isatty()
+            outcome = play(
+                plan, entrants, store, make_controller, jobs, **options, crew=crew, bar=bar
+            )
+    except KeyboardInterrupt:
+        _tell(f"stopped; {store.folder} keeps what was played, and the same command goes on")
+        raise
+    made = write_all(args, plan, entrants, outcome, time.time() - started, _tell)
+    if outcome.failures:
+        _tell(f"left out: {', '.join(outcome.failures)}")
+        return made._replace(code=EXIT_ROWS_FAILED)
+    return made
+
+
+def _tell(line: str) -> None:
+    """Print a line on stderr, above a progress bar if there is one."""
+    from tqdm import tqdm  # type: ignore[import-untyped]
+
+    tqdm.write(line, file=sys.stderr)
+    sys.stderr.flush()
+
+
+@contextmanager
+def _crew(args: Namespace, store: RecordStore) -> Iterator[Crew | None]:
+    if args.ray is None:
+        yield None
+        return
+    try:
+        from sb3_roles.evaluation.ray_grid import RayCrew, RayError
+    except ImportError:
+        raise UsageError("argument --ray: install sb3_roles[ray] to use it") from None
+    from sb3_roles.zoo.entrants import make_controller
+
+    try:
+        crew = RayCrew(args.ray, make_controller, store, n_cpus())
+    except RayError as error:
+        raise UsageError(f"argument --ray: {error}") from None
+    try:
+        yield crew
+    finally:
+        crew.close()
+
+
+def _lines_of(survey: Survey, jobs: int) -> Iterator[str]:
+    from sb3_roles.evaluation.progress import duration
+
+    total = 0.0
+    for name, count in survey.counts().items():
+        total += count.seconds
+        left = f", about {duration(count.seconds)} on one CPU" if count.missing else ""
+        yield f"{name}: {count.there} blocks are there, {count.missing} are missing{left}"
+    if total:
+        yield f"about {duration(total / jobs)} with --jobs {jobs}"
+    else:
+        yield "nothing is missing"
