@@ -13,9 +13,9 @@ import numpy as np
 
 from sb3_roles.baselines import controller_class
 from sb3_roles.baselines.random import RandomController
-from sb3_roles.evaluation.entrants import Entrant, Results
-from sb3_roles.evaluation.plan import Plan
-from sb3_roles.evaluation.plan_file import parse_plan
+from sb3_roles.evaluation.grid.entrants import Entrant, Results
+from sb3_roles.evaluation.grid.plan import Plan
+from sb3_roles.evaluation.grid.plan_file import parse_plan
 from sb3_roles.evaluation.records import TIMINGS, EpisodeRecords
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from sb3_roles.baselines import controller_class
 from sb3_roles.baselines.random import RandomController
-from sb3_roles.evaluation.entrants import Entrant
-from sb3_roles.evaluation.plan import Column, Plan, Table
-from sb3_roles.evaluation.plan_file import parse_plan
-from sb3_roles.evaluation.tables import TableResult, TableRow, Value
+from sb3_roles.evaluation.grid.entrants import Entrant
+from sb3_roles.evaluation.grid.plan import Column, Plan, Table
+from sb3_roles.evaluation.grid.plan_file import parse_plan
+from sb3_roles.evaluation.tables.model import TableResult, TableRow, Value
 
 EASY, HARD = Column("easy", 2), Column("hard", 2)
 HOSTILE = "</script><img src=x onerror=alert(1)> & \"quoted\" 'text'"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sb3_roles.evaluation.aggregate import (
+from sb3_roles.evaluation.tables.aggregate import (
     MIN_EPISODES,
     Comparison,
     interquartile_mean,

@@ -17,9 +17,7 @@ import pytest
 import yaml
 from helpers import one_line
 
-from sb3_roles.evaluation.aggregate import interval_over_runs
-from sb3_roles.evaluation.entrants import Entrant, Played, Results
-from sb3_roles.evaluation.figure_data import (
+from sb3_roles.evaluation.figures.data import (
     Bar,
     Curve,
     Logs,
@@ -29,19 +27,21 @@ from sb3_roles.evaluation.figure_data import (
     mean_band,
     role_shares,
 )
-from sb3_roles.evaluation.figure_looks import looks
-from sb3_roles.evaluation.figures import caption, draw_figures
-from sb3_roles.evaluation.intervals import estimate_mean
-from sb3_roles.evaluation.plan import Column, Plan
-from sb3_roles.evaluation.plan_file import parse_plan
-from sb3_roles.evaluation.records import EpisodeRecords
-from sb3_roles.evaluation.scores import score_cell
-from sb3_roles.evaluation.training_logs import (
+from sb3_roles.evaluation.figures.draw import caption, draw_figures
+from sb3_roles.evaluation.figures.looks import looks
+from sb3_roles.evaluation.figures.training_logs import (
     TrainingLog,
     TrainingLogError,
     read_training_log,
     smoothed,
 )
+from sb3_roles.evaluation.grid.entrants import Entrant, Played, Results
+from sb3_roles.evaluation.grid.plan import Column, Plan
+from sb3_roles.evaluation.grid.plan_file import parse_plan
+from sb3_roles.evaluation.intervals import estimate_mean
+from sb3_roles.evaluation.records import EpisodeRecords
+from sb3_roles.evaluation.tables.aggregate import interval_over_runs
+from sb3_roles.evaluation.tables.scores import score_cell
 
 ROOT = Path(__file__).resolve().parent.parent
 HARD, EASY = Column("hard", 4), Column("easy", 4)

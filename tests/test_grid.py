@@ -13,16 +13,17 @@ from grids import assert_same, assert_same_results, make, plan_data, scripted, s
 
 from area_search import get_scene
 from sb3_roles.baselines import controller_class
-from sb3_roles.evaluation import crews, processes
-from sb3_roles.evaluation.crews import Controllers, Here, Parcel, Task, play_block
-from sb3_roles.evaluation.entrants import Entrant
+from sb3_roles.common.durations import long_duration
 from sb3_roles.evaluation.episodes import held_out_seed, run_episodes
-from sb3_roles.evaluation.grid import Survey, play
-from sb3_roles.evaluation.plan import Column, Row
-from sb3_roles.evaluation.plan_file import parse_plan
-from sb3_roles.evaluation.progress import Estimates, Progress, duration
+from sb3_roles.evaluation.grid import crews, processes
+from sb3_roles.evaluation.grid.crews import Controllers, Here, Parcel, Task, play_block
+from sb3_roles.evaluation.grid.entrants import Entrant
+from sb3_roles.evaluation.grid.plan import Column, Row
+from sb3_roles.evaluation.grid.plan_file import parse_plan
+from sb3_roles.evaluation.grid.play import Survey, play
+from sb3_roles.evaluation.grid.progress import Estimates, Progress
+from sb3_roles.evaluation.grid.store import RecordStore
 from sb3_roles.evaluation.records import read_records, write_records
-from sb3_roles.evaluation.store import RecordStore
 
 PLAN = small_plan()
 CELLS = [(row, Column(scene, 2)) for scene in ("easy", "hard") for row in ("random", "greedy")]
@@ -150,7 +151,7 @@ def test_estimates_follow_what_was_measured():
 
 
 def test_times_are_for_readers(capsys):
-    texts = [duration(s) for s in (0.0, 1.4, 89, 91, 600, 5360, 5400, 36000)]
+    texts = [long_duration(s) for s in (0.0, 1.4, 89, 91, 600, 5360, 5400, 36000)]
     assert texts == ["1 s", "1 s", "89 s", "2 min", "10 min", "89 min", "1 h 30 min", "10 h 0 min"]
     lines: list[str] = []
     progress = Progress(2, 1, lines.append, bar=True)

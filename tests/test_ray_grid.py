@@ -15,10 +15,10 @@ pytest.importorskip("ray", reason="the extra ray is not installed")
 import ray
 from ray.cluster_utils import Cluster
 
-from sb3_roles.evaluation.entrants import Entrant
-from sb3_roles.evaluation.grid import play
-from sb3_roles.evaluation.ray_grid import RayCrew, RayError
-from sb3_roles.evaluation.store import RecordStore
+from sb3_roles.evaluation.grid.entrants import Entrant
+from sb3_roles.evaluation.grid.play import play
+from sb3_roles.evaluation.grid.ray_crew import RayCrew, RayError
+from sb3_roles.evaluation.grid.store import RecordStore
 
 ROOT = Path(__file__).resolve().parents[1]
 NODE = {"num_cpus": 1, "object_store_memory": 100_000_000, "include_dashboard": False}

@@ -29,9 +29,9 @@ from report_pages import (
 )
 
 from area_search.scenes import SCENES, Scene, get_scene
-from sb3_roles.evaluation.entrants import Entrant
 from sb3_roles.evaluation.episodes import held_out_seed, run_episodes
-from sb3_roles.evaluation.plan import Column
+from sb3_roles.evaluation.grid.entrants import Entrant
+from sb3_roles.evaluation.grid.plan import Column
 from sb3_roles.evaluation.report import page
 from sb3_roles.evaluation.report.summary import is_reached, printed_cells, summarize_tables
 from sb3_roles.evaluation.report.traces import (
@@ -397,8 +397,8 @@ def test_the_same_input_gives_the_same_page(tmp_path: Path) -> None:
 
 
 def test_the_plan_of_the_project_has_a_page(tmp_path: Path) -> None:
-    from sb3_roles.evaluation.plan_file import parse_plan
-    from sb3_roles.evaluation.tables import make_tables
+    from sb3_roles.evaluation.grid.plan_file import parse_plan
+    from sb3_roles.evaluation.tables.model import make_tables
 
     plan = parse_plan(yaml.safe_load((CONFIGS / "tables.yml").read_text(encoding="utf-8")))
     _, elements = written(tmp_path, plan=plan, tables=make_tables(plan, {}), traces=[])

@@ -16,9 +16,9 @@ from area_search import get_scene
 from sb3_roles.baselines.random import RandomController
 from sb3_roles.evaluation import records as records_module
 from sb3_roles.evaluation.episodes import describe, held_out_seed, run_episodes
-from sb3_roles.evaluation.plan import Column
+from sb3_roles.evaluation.grid.plan import Column
+from sb3_roles.evaluation.grid.store import RecordStore, Series, Span, concatenate, spans
 from sb3_roles.evaluation.records import EpisodeRecords, read_records, write_records
-from sb3_roles.evaluation.store import RecordStore, Series, Span, concatenate, spans
 
 SEED = held_out_seed(7)
 COLUMN = Column("easy", 2)

@@ -10,22 +10,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sb3_roles.evaluation.aggregate import interval_over_runs
-from sb3_roles.evaluation.entrants import Entrant, Played
+from sb3_roles.common.durations import short_duration
 from sb3_roles.evaluation.episodes import held_out_seed
+from sb3_roles.evaluation.grid.entrants import Entrant, Played
+from sb3_roles.evaluation.grid.plan import Column
+from sb3_roles.evaluation.grid.plan_file import parse_plan
 from sb3_roles.evaluation.metrics import summarize
-from sb3_roles.evaluation.plan import Column
-from sb3_roles.evaluation.plan_file import parse_plan
 from sb3_roles.evaluation.records import EpisodeRecords
-from sb3_roles.evaluation.table_text import DASH, duration, text_of
-from sb3_roles.evaluation.table_writers import (
+from sb3_roles.evaluation.tables.aggregate import interval_over_runs
+from sb3_roles.evaluation.tables.model import Value, make_tables
+from sb3_roles.evaluation.tables.text import DASH, text_of
+from sb3_roles.evaluation.tables.writers import (
     CSV_COLUMNS,
     latex_text,
     to_csv,
     to_latex,
     to_markdown,
 )
-from sb3_roles.evaluation.tables import Value, make_tables
 
 HORIZON, CELLS = 10, 1000
 HARD, EASY = Column("hard", 4), Column("easy", 4)
@@ -305,7 +306,7 @@ def test_times_are_whole_steps_and_shares_stand_beside_them():
     ("seconds", "text"), [(2.6e-3, "2.6 ms"), (1.5, "1.5 s"), (4.321e-6, "4.32 µs")]
 )
 def test_durations(seconds, text):
-    assert duration(seconds) == text
+    assert short_duration(seconds) == text
 
 
 def test_notes_are_made_of_the_data(tables):

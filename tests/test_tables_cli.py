@@ -21,7 +21,7 @@ import yaml
 from grids import assert_same, plan_data
 
 from sb3_roles.common.checkpoint import CheckpointFolder
-from sb3_roles.evaluation.plan_file import parse_plan
+from sb3_roles.evaluation.grid.plan_file import parse_plan
 from sb3_roles.evaluation.records import read_records
 from sb3_roles.zoo import tables
 from sb3_roles.zoo.cli import main
@@ -482,7 +482,7 @@ def test_its_processes_end_with_it(how, tmp_path):
 
 def test_ray_is_asked_for_by_name(tell, plan, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "sb3_roles.evaluation.ray_grid", raising=False)
+    monkeypatch.delitem(sys.modules, "sb3_roles.evaluation.grid.ray_crew", raising=False)
     code, _, err = tell("--plan", plan, "--ray", "local")
     assert code == 2
     assert err == ["sb3-roles tables: error: argument --ray: install sb3_roles[ray] to use it"]

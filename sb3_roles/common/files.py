@@ -18,7 +18,8 @@ def write_atomically(path: Path, content: bytes) -> None:
     :raises OSError: if it can not be written; an earlier file of that name is whole then
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
+    # Of this process: another one may be writing the same file.
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         partial.write_bytes(content)
         os.replace(partial, path)

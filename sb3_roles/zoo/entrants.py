@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_roles.common.names import closest
-from sb3_roles.evaluation.entrants import Entrant
+from sb3_roles.evaluation.grid.entrants import Entrant
 from sb3_roles.zoo.config import CONFIG_FILE
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import UsageError
@@ -24,7 +24,7 @@ from sb3_roles.zoo.run_folder import CHECKPOINTS
 
 if TYPE_CHECKING:
     from sb3_roles.baselines.base import Controller
-    from sb3_roles.evaluation.plan import Figure, Plan, Table
+    from sb3_roles.evaluation.grid.plan import Figure, Plan, Table
 
 
 def make_controller(entrant: Entrant) -> Controller:

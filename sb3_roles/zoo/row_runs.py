@@ -26,8 +26,8 @@ from sb3_roles.zoo.run_folder import CHECKPOINTS
 
 if TYPE_CHECKING:
     from sb3_roles.common.checkpoint import Checkpoint
-    from sb3_roles.evaluation.entrants import Entrant
-    from sb3_roles.evaluation.plan import Plan, Row
+    from sb3_roles.evaluation.grid.entrants import Entrant
+    from sb3_roles.evaluation.grid.plan import Plan, Row
 
 LOGS = Path("logs")
 # Two runs that differ in these alone are runs of one configuration.
@@ -92,7 +92,7 @@ class Run:
 
     def entrant(self, row: Row) -> Entrant:
         """Return who plays for a row with its weights."""
-        from sb3_roles.evaluation.entrants import Entrant
+        from sb3_roles.evaluation.grid.entrants import Entrant
 
         return Entrant(row.name, str(self.folder), True, row.drawn, self.seed, self.env_steps)
 

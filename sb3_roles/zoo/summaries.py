@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.common.durations import short_duration
+
 if TYPE_CHECKING:
     from sb3_roles.evaluation.records import EpisodeRecords
 
@@ -176,4 +178,4 @@ def _interval(metric: Mapping[str, Any]) -> str:
 
 
 def _decision(times: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {duration(times[name])}" for name in ("median", "mean", "p95"))
+    return ", ".join(f"{name} {short_duration(times[name])}" for name in ("median", "mean", "p95"))

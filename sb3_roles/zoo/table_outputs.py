@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_roles._version import __version__
+from sb3_roles.common.durations import long_duration
 from sb3_roles.common.files import write_atomically
-from sb3_roles.evaluation.entrants import Entrant, Entrants, Results
-from sb3_roles.evaluation.grid import Outcome
-from sb3_roles.evaluation.plan import Plan
-from sb3_roles.evaluation.progress import duration
-from sb3_roles.evaluation.store import Report
-from sb3_roles.evaluation.table_writers import to_csv, to_latex, to_markdown
-from sb3_roles.evaluation.tables import TableResult, make_tables
+from sb3_roles.evaluation.grid.entrants import Entrant, Entrants, Results
+from sb3_roles.evaluation.grid.plan import Plan
+from sb3_roles.evaluation.grid.play import Outcome
+from sb3_roles.evaluation.grid.store import Report
+from sb3_roles.evaluation.tables.model import TableResult, make_tables
+from sb3_roles.evaluation.tables.writers import to_csv, to_latex, to_markdown
 from sb3_roles.zoo.entrants import make_controller
 from sb3_roles.zoo.run_folder import source_commit
 from sb3_roles.zoo.tables import PAGE
@@ -113,7 +113,7 @@ def _draw(
     if not plan.figures:
         return {}
     try:
-        from sb3_roles.evaluation.figures import caption, draw_figures
+        from sb3_roles.evaluation.figures.draw import caption, draw_figures
 
         paths = draw_figures(plan, results, logs, args.out / FIGURES, args.quick, tell)
     except ImportError:
@@ -133,5 +133,5 @@ def _facts(seconds: float) -> dict[str, Any]:
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "version": f"sb3_roles {__version__}, commit {source_commit(Path(__file__)) or 'unknown'}",
-        "made": f"{time.strftime('%Y-%m-%d %H:%M')} in {duration(seconds)}",
+        "made": f"{time.strftime('%Y-%m-%d %H:%M')} in {long_duration(seconds)}",
     }

@@ -12,14 +12,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.common.durations import long_duration
 from sb3_roles.zoo.config import config_file, read_yaml
 from sb3_roles.zoo.options import UsageError, whole_number
 
 if TYPE_CHECKING:
-    from sb3_roles.evaluation.crews import Crew
-    from sb3_roles.evaluation.grid import Survey
-    from sb3_roles.evaluation.plan import Plan
-    from sb3_roles.evaluation.store import RecordStore
+    from sb3_roles.evaluation.grid.crews import Crew
+    from sb3_roles.evaluation.grid.plan import Plan
+    from sb3_roles.evaluation.grid.play import Survey
+    from sb3_roles.evaluation.grid.store import RecordStore
     from sb3_roles.zoo.options import Parser, Subparsers
     from sb3_roles.zoo.table_outputs import Made
 
@@ -135,7 +136,7 @@ def run(args: Namespace) -> int:
     if made is None:
         return 0
     if len(made.tables) == 1:
-        from sb3_roles.evaluation.table_writers import to_markdown
+        from sb3_roles.evaluation.tables.writers import to_markdown
 
         print(f"\n{to_markdown(made.tables)}", end="")
     return made.code
@@ -162,8 +163,8 @@ def read_plan(args: Namespace) -> Plan:
     :param args: parsed arguments
     :raises UsageError: if the file or a name is wrong
     """
-    from sb3_roles.evaluation.plan import PlanError
-    from sb3_roles.evaluation.plan_file import parse_plan
+    from sb3_roles.evaluation.grid.plan import PlanError
+    from sb3_roles.evaluation.grid.plan_file import parse_plan
 
     file = config_file("tables") if args.plan is None else args.plan
     try:
@@ -192,8 +193,8 @@ def make(args: Namespace) -> Made | None:
             raise UsageError(f"argument --out: {str(args.out)!r} can not be written")
     # Read when they are imported: a job is one thread.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from sb3_roles.evaluation.grid import Survey, play
-    from sb3_roles.evaluation.store import RecordStore
+    from sb3_roles.evaluation.grid.play import Survey, play
+    from sb3_roles.evaluation.grid.store import RecordStore
     from sb3_roles.zoo.entrants import find_entrants, make_controller, run_files
     from sb3_roles.zoo.table_outputs import write_all
 
@@ -239,7 +240,7 @@ def _crew(args: Namespace, store: RecordStore) -> Iterator[Crew | None]:
         yield None
         return
     try:
-        from sb3_roles.evaluation.ray_grid import RayCrew, RayError
+        from sb3_roles.evaluation.grid.ray_crew import RayCrew, RayError
     except ImportError:
         raise UsageError("argument --ray: install sb3_roles[ray] to use it") from None
     from sb3_roles.zoo.entrants import make_controller
@@ -255,14 +256,12 @@ def _crew(args: Namespace, store: RecordStore) -> Iterator[Crew | None]:
 
 
 def _lines_of(survey: Survey, jobs: int) -> Iterator[str]:
-    from sb3_roles.evaluation.progress import duration
-
     total = 0.0
     for name, count in survey.counts().items():
         total += count.seconds
-        left = f", about {duration(count.seconds)} on one CPU" if count.missing else ""
+        left = f", about {long_duration(count.seconds)} on one CPU" if count.missing else ""
         yield f"{name}: {count.there} blocks are there, {count.missing} are missing{left}"
     if total:
-        yield f"about {duration(total / jobs)} with --jobs {jobs}"
+        yield f"about {long_duration(total / jobs)} with --jobs {jobs}"
     else:
         yield "nothing is missing"

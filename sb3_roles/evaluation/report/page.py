@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from sb3_roles.common.files import write_atomically
-from sb3_roles.evaluation.plan import Column, Figure, Plan, Table
+from sb3_roles.evaluation.grid.plan import Column, Figure, Plan, Table
 from sb3_roles.evaluation.report.summary import is_reached, printed_cells, summarize_tables
 from sb3_roles.evaluation.report.traces import Trace, encode_traces
-from sb3_roles.evaluation.tables import METRIC_LABELS
+from sb3_roles.evaluation.tables.model import METRIC_LABELS
 
 if TYPE_CHECKING:
-    from sb3_roles.evaluation.tables import TableResult, TableRow, Value
+    from sb3_roles.evaluation.tables.model import TableResult, TableRow, Value
 
 TITLE = "Multi-robot area search: tables, figures and episodes"
 SCRIPTS = ("page.js", "tables.js", "honesty.js", "map.js", "pane.js", "player.js")

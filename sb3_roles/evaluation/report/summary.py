@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import mean
 from typing import TYPE_CHECKING, NamedTuple
 
-from sb3_roles.evaluation.plan import SCORES, Column, Plan
+from sb3_roles.evaluation.grid.plan import SCORES, Column, Plan
 
 if TYPE_CHECKING:
-    from sb3_roles.evaluation.tables import TableResult, TableRow, Value
+    from sb3_roles.evaluation.tables.model import TableResult, TableRow, Value
 
 # Rows of zoo_configs/tables.yml that the sentences are about; those that a plan lacks are skipped.
 OURS, WITHOUT_ROLES, ASSIGNED, GREEDY, BOUND = (

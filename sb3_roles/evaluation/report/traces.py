@@ -11,9 +11,9 @@ import numpy as np
 
 from area_search.batch import BatchedAreaSearch
 from area_search.scenes import Scene, get_scene
-from sb3_roles.evaluation.entrants import Entrant, Entrants
 from sb3_roles.evaluation.episodes import Player, held_out_seed
-from sb3_roles.evaluation.plan import Column, Plan
+from sb3_roles.evaluation.grid.entrants import Entrant, Entrants
+from sb3_roles.evaluation.grid.plan import Column, Plan
 from sb3_roles.evaluation.records import NO_ROLE
 
 if TYPE_CHECKING:

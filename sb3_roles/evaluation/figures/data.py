@@ -10,18 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_roles.common.files import csv_bytes
-from sb3_roles.evaluation.aggregate import interquartile_mean, resample_runs
-from sb3_roles.evaluation.entrants import Played, Results
-from sb3_roles.evaluation.intervals import LEVEL, t_quantile
-from sb3_roles.evaluation.plan import Column, Figure
-from sb3_roles.evaluation.records import NO_ROLE, EpisodeRecords
-from sb3_roles.evaluation.scores import Score, score_cell
-from sb3_roles.evaluation.training_logs import (
+from sb3_roles.evaluation.figures.training_logs import (
     TrainingLog,
     TrainingLogError,
     read_training_log,
     smoothed,
 )
+from sb3_roles.evaluation.grid.entrants import Played, Results
+from sb3_roles.evaluation.grid.plan import Column, Figure
+from sb3_roles.evaluation.intervals import LEVEL, t_quantile
+from sb3_roles.evaluation.records import NO_ROLE, EpisodeRecords
+from sb3_roles.evaluation.tables.aggregate import interquartile_mean, resample_runs
+from sb3_roles.evaluation.tables.scores import Score, score_cell
 
 SMOOTHING = 5
 """Rollouts over which the curves of a training are averaged."""

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from sb3_roles.evaluation.plan import Column, Table
-from sb3_roles.evaluation.scores import CURVES
-from sb3_roles.evaluation.table_notes import most_episodes, seeds_of
-from sb3_roles.evaluation.tables import (
+from sb3_roles.common.durations import short_duration
+from sb3_roles.evaluation.grid.plan import Column, Table
+from sb3_roles.evaluation.tables.model import (
     METRIC_LABELS,
     TableResult,
     TableRow,
@@ -18,6 +17,8 @@ from sb3_roles.evaluation.tables import (
     columns_by_team,
     is_capped,
 )
+from sb3_roles.evaluation.tables.notes import most_episodes, seeds_of
+from sb3_roles.evaluation.tables.scores import CURVES
 
 DASH = "\N{EN DASH}"
 
@@ -162,15 +163,4 @@ def _number(number: float, metric: str, sign: str = "-") -> str:
 
 def _decision(row: TableRow, columns: Sequence[Column]) -> str:
     times = [row.decision[column] for column in columns if column in row.decision]
-    return duration(statistics.median(times)) if times else ""
-
-
-def duration(seconds: float) -> str:
-    """Return a duration with three digits and its unit.
-
-    :param seconds: at least 0
-    """
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-6:.3g} µs"
+    return short_duration(statistics.median(times)) if times else ""

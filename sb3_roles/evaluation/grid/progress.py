@@ -6,8 +6,9 @@ import sys
 from collections import defaultdict
 from typing import Any
 
-from sb3_roles.evaluation.plan import Cell, Row
-from sb3_roles.evaluation.store import Report
+from sb3_roles.common.durations import long_duration
+from sb3_roles.evaluation.grid.plan import Cell, Row
+from sb3_roles.evaluation.grid.store import Report
 
 # Seconds of a block of one robot, of a row that was never measured: blocks are chosen to take about
 # the same time, whatever an episode takes.
@@ -50,14 +51,6 @@ class Estimates:
         return _PRIOR * size / row.block
 
 
-def duration(seconds: float) -> str:
-    """Return a time for readers: ``40 s``, ``12 min``, ``3 h 20 min``."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
-
-
 class Progress:
     """Shows what was played: a bar on a terminal, elsewhere a line for each finished cell.
 
@@ -80,7 +73,7 @@ class Progress:
     def block_done(self, seconds_left: float) -> None:
         """One more block was played, or is no longer wanted."""
         if self._bar is not None:
-            self._bar.set_postfix_str(f"about {duration(seconds_left)} left", refresh=False)
+            self._bar.set_postfix_str(f"about {long_duration(seconds_left)} left", refresh=False)
             self._bar.update()
             self._bar.refresh()
 
@@ -89,7 +82,7 @@ class Progress:
         self._finished += 1
         if self._bar is None:
             row, column = cell
-            left = f", about {duration(seconds_left)} left" if seconds_left > 0 else ""
+            left = f", about {long_duration(seconds_left)} left" if seconds_left > 0 else ""
             self._report(
                 f"{row}, {column.scene}, {column.n_agents} robots: {n_episodes} episodes; "
                 f"{self._finished} of {self._n_cells} cells{left}"

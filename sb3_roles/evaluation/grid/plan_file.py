@@ -1,4 +1,4 @@
-"""Read a :class:`~sb3_roles.evaluation.plan.Plan` from what a YAML file says, and check it."""
+"""Read a :class:`~sb3_roles.evaluation.grid.plan.Plan` from what a YAML file says, and check it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from area_search.scenes import SCENES
 from sb3_roles.baselines import CONTROLLER_NAMES
 from sb3_roles.common.names import closest
-from sb3_roles.evaluation.plan import (
+from sb3_roles.evaluation.grid.plan import (
     FIGURE_METRICS,
     SCORES,
     Column,

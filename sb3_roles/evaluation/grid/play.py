@@ -10,7 +10,8 @@ from typing import NamedTuple
 import torch as th
 
 from area_search.scenes import get_scene
-from sb3_roles.evaluation.crews import (
+from sb3_roles.evaluation.episodes import describe, held_out_seed
+from sb3_roles.evaluation.grid.crews import (
     Controllers,
     Crew,
     Here,
@@ -19,13 +20,12 @@ from sb3_roles.evaluation.crews import (
     Task,
     error_line,
 )
-from sb3_roles.evaluation.entrants import Entrant, Entrants, Played, Results
-from sb3_roles.evaluation.episodes import describe, held_out_seed
-from sb3_roles.evaluation.plan import Cell, Plan
-from sb3_roles.evaluation.processes import Processes
-from sb3_roles.evaluation.progress import Estimates, Progress
+from sb3_roles.evaluation.grid.entrants import Entrant, Entrants, Played, Results
+from sb3_roles.evaluation.grid.plan import Cell, Plan
+from sb3_roles.evaluation.grid.processes import Processes
+from sb3_roles.evaluation.grid.progress import Estimates, Progress
+from sb3_roles.evaluation.grid.store import RecordStore, Report, Series, Span, concatenate, spans
 from sb3_roles.evaluation.records import EpisodeRecords
-from sb3_roles.evaluation.store import RecordStore, Report, Series, Span, concatenate, spans
 
 Files = Callable[[Entrant], Mapping[str, bytes]]
 """Reads what a learned entrant's controller is made of, see ``Parcel``."""

@@ -1,6 +1,6 @@
 """From what was played to tables: the numbers, their intervals, and the paper's beside them.
 
-``table_writers`` writes them as Markdown, LaTeX and CSV.
+``tables.writers`` writes them as Markdown, LaTeX and CSV.
 """
 
 from __future__ import annotations
@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from sb3_roles.evaluation.aggregate import Comparison, last_value, time_above
-from sb3_roles.evaluation.entrants import Entrant, Played, Results
-from sb3_roles.evaluation.plan import Column, Plan, Row, Table
-from sb3_roles.evaluation.scores import (
+from sb3_roles.evaluation.grid.entrants import Entrant, Played, Results
+from sb3_roles.evaluation.grid.plan import Column, Plan, Row, Table
+from sb3_roles.evaluation.tables.aggregate import Comparison, last_value, time_above
+from sb3_roles.evaluation.tables.notes import most_episodes, notes_of
+from sb3_roles.evaluation.tables.scores import (
     CURVES,
     Score,
     check_results,
@@ -20,7 +21,6 @@ from sb3_roles.evaluation.scores import (
     score_scenes,
     values_of,
 )
-from sb3_roles.evaluation.table_notes import most_episodes, notes_of
 
 METRIC_LABELS = {
     "explo_paper": "Explored, paper's count (explo_paper), %",

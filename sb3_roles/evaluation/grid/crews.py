@@ -15,10 +15,10 @@ import torch as th
 
 from area_search.scenes import get_scene
 from sb3_roles.common.names import one_line
-from sb3_roles.evaluation.entrants import Entrant
 from sb3_roles.evaluation.episodes import describe, run_episodes
+from sb3_roles.evaluation.grid.entrants import Entrant
+from sb3_roles.evaluation.grid.store import RecordStore, Series, Span
 from sb3_roles.evaluation.records import EpisodeRecords
-from sb3_roles.evaluation.store import RecordStore, Series, Span
 
 if TYPE_CHECKING:
     from sb3_roles.baselines.base import Controller

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.evaluation.figure_data import Bar
-from sb3_roles.evaluation.figure_looks import AXES, WIDTH, Look, legend, looks, rows_of, team
-from sb3_roles.evaluation.plan import Figure, Plan
+from sb3_roles.evaluation.figures.data import Bar
+from sb3_roles.evaluation.figures.looks import AXES, WIDTH, Look, legend, looks, rows_of, team
+from sb3_roles.evaluation.grid.plan import Figure, Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ import ray
 from ray.exceptions import RayError as _RayError
 
 from sb3_roles.common.names import one_line
-from sb3_roles.evaluation.crews import (
+from sb3_roles.evaluation.grid.crews import (
     Controllers,
     Finished,
     Make,
@@ -25,8 +25,8 @@ from sb3_roles.evaluation.crews import (
     keep,
     play_block,
 )
+from sb3_roles.evaluation.grid.store import RecordStore
 from sb3_roles.evaluation.records import EpisodeRecords
-from sb3_roles.evaluation.store import RecordStore
 
 LOCAL = "local"
 # Losses of a worker or of its machine; errors of a controller are no reason to try again.

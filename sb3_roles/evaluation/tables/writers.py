@@ -7,8 +7,8 @@ import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-from sb3_roles.evaluation.table_text import Line, Text, blocks_of
-from sb3_roles.evaluation.tables import TableResult, TableRow, Value
+from sb3_roles.evaluation.tables.model import TableResult, TableRow, Value
+from sb3_roles.evaluation.tables.text import Line, Text, blocks_of
 
 CSV_COLUMNS = (
     "table",

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_roles.common.thresholds import THRESHOLD
-from sb3_roles.evaluation.figure_bars import draw_bars
-from sb3_roles.evaluation.figure_data import Bar, Curve, Drawn
-from sb3_roles.evaluation.figure_looks import (
+from sb3_roles.evaluation.figures.bars import draw_bars
+from sb3_roles.evaluation.figures.data import Bar, Curve, Drawn
+from sb3_roles.evaluation.figures.looks import (
     AXES,
     MARKERS,
     WIDTH,
@@ -23,7 +23,7 @@ from sb3_roles.evaluation.figure_looks import (
     rows_of,
     team,
 )
-from sb3_roles.evaluation.plan import Figure, Plan
+from sb3_roles.evaluation.grid.plan import Figure, Plan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

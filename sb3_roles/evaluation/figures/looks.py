@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sb3_roles.evaluation.figure_data import Bar, Curve
-from sb3_roles.evaluation.plan import Figure, Plan
+from sb3_roles.evaluation.figures.data import Bar, Curve
+from sb3_roles.evaluation.grid.plan import Figure, Plan
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

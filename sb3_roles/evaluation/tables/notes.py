@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from sb3_roles.evaluation.aggregate import MIN_EPISODES, N_RESAMPLES
 from sb3_roles.evaluation.episodes import stream_of
-from sb3_roles.evaluation.plan import Plan, Table
+from sb3_roles.evaluation.grid.plan import Plan, Table
+from sb3_roles.evaluation.tables.aggregate import MIN_EPISODES, N_RESAMPLES
 
 if TYPE_CHECKING:
-    from sb3_roles.evaluation.tables import TableRow
+    from sb3_roles.evaluation.tables.model import TableRow
 
 _METRICS = {
     "explo_paper": "explo_paper, what the paper prints as exploration, counts the cells that were "

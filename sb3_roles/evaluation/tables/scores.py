@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_roles.evaluation.aggregate import interval_over_runs, mean_of_tasks
-from sb3_roles.evaluation.entrants import Played, Results
+from sb3_roles.evaluation.grid.entrants import Played, Results
+from sb3_roles.evaluation.grid.plan import SCORES
 from sb3_roles.evaluation.intervals import estimate_mean
 from sb3_roles.evaluation.metrics import decision_time, summarize
-from sb3_roles.evaluation.plan import SCORES
+from sb3_roles.evaluation.tables.aggregate import interval_over_runs, mean_of_tasks
 
 CURVES = ("explo_paper", "explo_true", "cover")
 """Of ``SCORES``, those that every episode has: percentages."""

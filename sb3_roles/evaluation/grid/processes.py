@@ -13,8 +13,8 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING
 
-from sb3_roles.evaluation.crews import Controllers, Finished, Make, Task, keep, play_block
-from sb3_roles.evaluation.store import RecordStore, Report, Span
+from sb3_roles.evaluation.grid.crews import Controllers, Finished, Make, Task, keep, play_block
+from sb3_roles.evaluation.grid.store import RecordStore, Report, Span
 
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess

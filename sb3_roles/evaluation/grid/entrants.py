@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from sb3_roles.evaluation.plan import Cell
+from sb3_roles.evaluation.grid.plan import Cell
 from sb3_roles.evaluation.records import EpisodeRecords
 
 

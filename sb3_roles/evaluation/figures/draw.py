@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_roles.common.files import write_atomically
-from sb3_roles.evaluation.entrants import Results
-from sb3_roles.evaluation.figure_data import (
+from sb3_roles.evaluation.figures.data import (
     SMOOTHING,
     Bar,
     Curve,
@@ -18,9 +17,10 @@ from sb3_roles.evaluation.figure_data import (
     collect,
     csv_of,
 )
-from sb3_roles.evaluation.figure_files import SUFFIXES, drawing_style, render
-from sb3_roles.evaluation.figure_panels import draw
-from sb3_roles.evaluation.plan import Figure, Plan
+from sb3_roles.evaluation.figures.files import SUFFIXES, drawing_style, render
+from sb3_roles.evaluation.figures.panels import draw
+from sb3_roles.evaluation.grid.entrants import Results
+from sb3_roles.evaluation.grid.plan import Figure, Plan
 
 _MEANINGS = {
     "explore_reward": "explore reward: newly seen cells of the team over B_e",

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_roles.common.names import one_line
-from sb3_roles.evaluation.plan import Column
+from sb3_roles.evaluation.grid.plan import Column
 from sb3_roles.evaluation.records import (
     EpisodeRecords,
     RecordsError,

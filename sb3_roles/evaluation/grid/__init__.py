@@ -1,0 +1,1 @@
+"""Play the cells of a plan, and keep what was played."""

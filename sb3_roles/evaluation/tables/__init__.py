@@ -1,0 +1,1 @@
+"""The tables of a plan, from records to Markdown, LaTeX and CSV."""
