@@ -45,6 +45,12 @@ def report_of(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
     return json.loads(capsys.readouterr().out)
 
 
+def test_runs_shorter_than_a_row_have_their_last_evaluation(tmp_path, capsys):
+    run = make_run(tmp_path / "a", "hmappo", [0.1, 0.4])
+    assert main(["curves", run, "--metrics", "cover", "--every", "10000"]) == 0
+    assert capsys.readouterr().out.splitlines()[2:] == ["| 2,000 | 40.0 % [40.0 .. 40.0] |"]
+
+
 def test_runs_have_labels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two settings of one algorithm are told apart, patterns name several runs."""
     for k in (1, 2, 10):

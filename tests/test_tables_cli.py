@@ -121,6 +121,46 @@ def test_tables_are_written_and_played_once(tell, plan, tmp_path):
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.parquet")}
 
 
+# (row, scene, robots) -> explo_paper and cover in %, of 500 episodes of another stream
+# (docs/baselines.md); the random team's are the paper's.
+KNOWN = {
+    ("random", "hard", 4): (22.2, 11.2),
+    ("random", "obstacles_16", 4): (18.8, 9.6),
+    ("greedy", "hard", 4): (92.8, 65.3),
+    ("greedy", "super_hard", 4): (97.1, 70.4),
+    ("greedy", "hard", 8): (112.8, 85.0),
+    ("greedy_assigned", "hard", 4): (96.3, 72.4),
+    ("greedy_assigned", "super_hard", 4): (103.4, 80.0),
+    ("greedy_assigned", "hard", 8): (119.2, 92.2),
+}
+
+
+def test_the_quick_form_of_the_papers_tables_is_plausible(tell, tmp_path):
+    code, _, _ = tell(
+        *("--quick", "--tables", "I,II,IV", "--rows", "random,greedy,greedy_assigned"),
+        *("--jobs", "1", "--out", str(tmp_path / "out")),
+    )
+    assert code == 0
+    found = {
+        (line["row"], line["scene"], int(line["n_agents"]), line["metric"]): line
+        for line in numbers_of(tmp_path / "out")
+    }
+    for (row, scene, n_agents), known in KNOWN.items():
+        for metric, value in zip(("explo_paper", "cover"), known, strict=True):
+            line = found[row, scene, n_agents, metric]
+            # Half of a 95 % interval is about two standard errors: five of them.
+            reach = 2.5 * (float(line["high"]) - float(line["low"])) / 2
+            assert abs(float(line["mean"]) - value) < reach, (row, scene, n_agents, metric)
+            assert line["n_episodes"] == "20"
+    for scene in ("easy", "medium", "hard", "super_hard", "obstacles_16", "obstacles_52"):
+        covers = [
+            float(found[row, scene, 4, "cover"]["mean"])
+            for row in ("random", "greedy", "greedy_assigned")
+        ]
+        assert covers == sorted(covers), scene
+    assert "quick form" in (tmp_path / "out" / "tables.md").read_text().lower()
+
+
 def test_a_dry_run_counts_and_writes_nothing(tell, plan, tmp_path):
     code, out, err = tell("--plan", plan, "--dry-run", "--jobs", "2", "--rows", "random")
     assert (code, err) == (0, [])

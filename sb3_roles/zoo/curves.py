@@ -230,14 +230,18 @@ def _table(curves: Curves, metrics: Sequence[str], every: float) -> list[str]:
 
 
 def _table_steps(curves: Curves, every: float) -> list[int]:
-    """For each ``every`` joint steps, the first evaluation at which most labels have a value."""
+    """For each ``every`` joint steps, the first evaluation at which most labels have a value.
+
+    Of runs that are shorter, it is the last one.
+    """
     chosen: dict[int, tuple[int, int]] = {}
-    for step in sorted({step for runs in curves.values() for step in _common_steps(runs)}):
+    steps = sorted({step for runs in curves.values() for step in _common_steps(runs)})
+    for step in steps:
         known = sum(all(run.reaches(step) for run in runs) for runs in curves.values())
         row = int(step // every)
         if row and known > chosen.get(row, (0, 0))[0]:
             chosen[row] = (known, step)
-    return [step for _, step in chosen.values()]
+    return [step for _, step in chosen.values()] or steps[-1:]
 
 
 def _plot(curves: Curves, metrics: Sequence[str], file: Path) -> None:

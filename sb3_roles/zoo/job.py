@@ -302,7 +302,8 @@ def _print_start(
     print(
         f"{'training' if resumed_at is None else 'resuming'} {config['algo']} on {config['env']}: "
         f"{team_env.n_teams} teams of {team_env.n_agents} ({type(team_env).__name__}), joint steps "
-        f"{resumed_at or 0} to {config['n_timesteps']}, seed {config['seed']}, "
+        f"{resumed_at or 0} to {config['n_timesteps']} in whole rollouts of "
+        f"{model.n_steps * team_env.n_teams}, seed {config['seed']}, "
         f"{model.device.type}, {th.get_num_threads()} threads, "
         f"OMP_WAIT_POLICY={os.environ.get('OMP_WAIT_POLICY')}\n"
         f"run folder {run}, {time.strftime('%Y-%m-%d %H:%M:%S')}",
