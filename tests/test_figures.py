@@ -332,6 +332,15 @@ def test_training_curves_have_the_band_of_their_seeds(tmp_path: Path) -> None:
 ROWS = [(1000, 0.1, 0.1), (2000, 0.2, 0.2)]
 
 
+def test_runs_without_a_common_step_are_left_out_with_a_line(tmp_path: Path) -> None:
+    early = make_run(tmp_path / "early", ROWS)
+    late = make_run(tmp_path / "late", [(3000, 0.1, 0.1), (4000, 0.2, 0.2)])
+    lines: list[str] = []
+    figure = parse_plan(PLAN).figures["train"]
+    assert not collect(figure, {}, {"hmappo": [early, late]}, lines.append)
+    assert lines == ["figure train: hmappo is left out: its runs share no joint steps"]
+
+
 @pytest.mark.parametrize(
     ("rows", "config", "says"),
     [
@@ -380,7 +389,13 @@ def test_missing_files_and_columns_and_cut_rows(tmp_path: Path, name: str) -> No
         (run / name).write_text(content.replace("rollout/cover", "rollout/other"))
         with pytest.raises(TrainingLogError, match="no column 'rollout/cover'"):
             read_training_log(run)
-        (run / name).write_text(content + "3000,0.5,0")
+        (run / name).write_text(content)
+        whole = read_training_log(run)
+        # What a training has half written is not there yet; a whole line is, however short.
+        for part in ("3000,0.5,0", "3000,0.5,0.4", "3", '"'):
+            (run / name).write_text(content + part)
+            assert read_training_log(run).steps.tolist() == whole.steps.tolist() == [1000, 2000]
+        (run / name).write_text(content + "3000,0.5\n")
         with pytest.raises(TrainingLogError, match="not as many entries"):
             read_training_log(run)
 

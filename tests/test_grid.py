@@ -18,11 +18,12 @@ from sb3_roles.evaluation.episodes import held_out_seed, run_episodes
 from sb3_roles.evaluation.grid import crews, processes
 from sb3_roles.evaluation.grid.crews import Controllers, Here, Parcel, Task, play_block
 from sb3_roles.evaluation.grid.entrants import Entrant
-from sb3_roles.evaluation.grid.plan import Column, Row
+from sb3_roles.evaluation.grid.plan import Column, PlanError, Row
 from sb3_roles.evaluation.grid.plan_file import parse_plan
-from sb3_roles.evaluation.grid.play import Survey, play
-from sb3_roles.evaluation.grid.progress import Estimates, Progress
+from sb3_roles.evaluation.grid.play import play
+from sb3_roles.evaluation.grid.progress import Estimates, Left, Progress
 from sb3_roles.evaluation.grid.store import RecordStore
+from sb3_roles.evaluation.grid.survey import Survey
 from sb3_roles.evaluation.records import read_records, write_records
 
 PLAN = small_plan()
@@ -129,7 +130,10 @@ def test_a_survey_counts_blocks_and_estimates_their_time(store):
     }
     for name, count in counts.items():
         taken = [one.blocks[one.spans[0]].seconds for one in survey.parts() if one.cell[0] == name]
-        assert count.seconds == pytest.approx(sum(taken) / 6 * 10)
+        assert count.left.seconds == pytest.approx(sum(taken) / 6 * 10)
+        assert count.left.known
+    unknown = Survey(PLAN, scripted(PLAN), RecordStore(store.folder / "none"), make).counts()
+    assert unknown == {"random": (0, 6, (0.0, False)), "greedy": (0, 6, (0.0, False))}
 
 
 def test_estimates_follow_what_was_measured():
@@ -140,7 +144,10 @@ def test_estimates_follow_what_was_measured():
     estimates = Estimates()
     # Before anything is known, small blocks are those of slow rows.
     assert estimates.seconds(slow, 4, 10) == pytest.approx(10 * estimates.seconds(fast, 4, 10))
+    assert not estimates.knows(slow)
     estimates.add(slow, 4, 10, 20.0)
+    assert estimates.knows(slow)
+    assert not estimates.knows(fast)
     assert estimates.seconds(slow, 4, 5) == pytest.approx(10.0)
     # Other teams are estimated by their size, until they are measured.
     assert estimates.seconds(slow, 16, 5) == pytest.approx(20.0)
@@ -155,11 +162,22 @@ def test_times_are_for_readers(capsys):
     assert texts == ["1 s", "1 s", "89 s", "2 min", "10 min", "89 min", "1 h 30 min", "10 h 0 min"]
     lines: list[str] = []
     progress = Progress(2, 1, lines.append, bar=True)
-    progress.block_done(300.0)
-    progress.cell_done(("random", Column("easy", 2)), 8, 300.0)
+    progress.block_done(Left(300.0, True))
+    progress.cell_done(("random", Column("easy", 2)), 8, Left(300.0, True))
     progress.close()
     assert lines == []
-    assert "1 of 2 blocks" in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert "1 of 2 blocks" in shown
+    assert "about 5 min left" in shown
+    progress = Progress(4, 4, lines.append)
+    for left in (Left(300.0, True), Left(300.0, False), Left(0.0, False), Left(0.0, True)):
+        progress.cell_done(("random", Column("easy", 2)), 8, left)
+    assert [line.partition("cells")[2] for line in lines] == [
+        ", about 5 min left",
+        ", more than 5 min left",
+        ", time not known yet",
+        "",
+    ]
 
 
 def test_a_row_that_fails_does_not_stop_the_others(store, lines):
@@ -195,6 +213,145 @@ def test_a_disk_that_refuses_ends_the_run(store, monkeypatch):
     monkeypatch.setattr(store, "write", refuse)
     with pytest.raises(OSError, match="No space left"):
         play(PLAN, scripted(PLAN), store, make, report=lambda _: None)
+
+
+def test_what_was_packed_plays_and_comes_back(store):
+    """The steps are those of the weights, whatever was known of the run before."""
+    plan = small_plan(("random", "learned", "broken"))
+    learned = [Entrant("learned", f"/{n}", True, training_seed=n, env_steps=10) for n in (1, 2)]
+    entrants = {
+        "random": [Entrant("random", "random")],
+        "learned": learned,
+        "broken": [Entrant("broken", "failing")],
+    }
+    packed = []
+
+    def pack(one: Entrant) -> Parcel:
+        packed.append(one)
+        if not one.learned:
+            return Parcel(one)
+        return Parcel(replace(one, env_steps=20 + len(packed)), {"name": b"greedy"})
+
+    def read(one: Entrant):
+        if not one.learned:
+            return make(one)
+        return controller_class(Path(one.source, "name").read_text())()
+
+    outcome = play(plan, entrants, store, read, report=lambda _: None, pack=pack)
+    assert packed == [entrants["random"][0], *learned, entrants["broken"][0]]
+    expected = [replace(learned[0], env_steps=22), replace(learned[1], env_steps=23)]
+    for (row, _), ones in outcome.results.items():
+        assert row != "learned" or [one.entrant for one in ones] == expected
+    assert set(outcome.parcels) == {"random", "learned"}
+    assert outcome.parcels["learned"] == Parcel(expected[0], {"name": b"greedy"})
+    assert type(outcome.parcels["learned"].open(read)).__name__ == "GreedyController"
+
+
+@pytest.mark.parametrize("where", ["packed", "opened here", "opened to play"])
+def test_a_full_disk_ends_the_run_wherever_it_is(where, store, monkeypatch):
+    """The same for a controller's files as for the store: no row is at fault."""
+    plan = small_plan(("random", "learned"))
+    entrants = {"random": [Entrant("random", "random")]}
+    entrants["learned"] = [Entrant("learned", "/nowhere", learned=True)]
+    opened = []
+
+    def write(path: Path, content: bytes) -> None:
+        opened.append(path)
+        raise OSError(28, "No space left on device")
+
+    def pack(one: Entrant) -> Parcel:
+        if where == "packed":
+            raise OSError(28, "No space left on device", "/tmp/x")
+        return Parcel(one, {"name": b"greedy"} if one.learned else {})
+
+    def read(one: Entrant):
+        return controller_class("random")()
+
+    if where == "opened here":
+        monkeypatch.setattr(Path, "write_bytes", write)
+    if where == "opened to play":
+        # A process has its own controllers: the survey's are made.
+        original = Here.submit
+
+        def submit(self: Here, task: Task) -> None:
+            monkeypatch.setattr(Path, "write_bytes", write)
+            original(self, task)
+
+        monkeypatch.setattr(Here, "submit", submit)
+        entrants = {"learned": entrants["learned"]}
+    with pytest.raises(OSError, match="No space left") as caught:
+        play(plan, entrants, store, read, report=lambda _: None, pack=pack)
+    assert caught.value.filename == ("/tmp/x" if where == "packed" else str(opened[-1]))
+
+
+def test_records_of_several_versions_in_a_cell_are_reported(store, lines):
+    play(PLAN, scripted(PLAN), store, make, report=lambda _: None)
+
+    def change(pattern: str, **versions: str) -> None:
+        for path in store.folder.glob(pattern):
+            found = read_records(path)
+            versions = {**found.metadata["versions"], **versions}
+            write_records(replace(found, metadata={**found.metadata, "versions": versions}), path)
+
+    # One that older records do not state is no difference.
+    change("greedy/easy-2/*/0-3.parquet", ortools="9.15")
+    play(PLAN, scripted(PLAN), store, make, report=lines.append)
+    assert lines == []
+    change("greedy/easy-2/*/3-6.parquet", ortools="9.14")
+    change("greedy/hard-2/*/3-6.parquet", numpy="1.0")
+    play(PLAN, scripted(PLAN), store, make, report=lines.append)
+    assert lines == [
+        "2 cells mix records of several versions, such as greedy, easy, 2 robots: "
+        "ortools 9.14, 9.15"
+    ]
+
+
+def number(**paper: object) -> dict[str, object]:
+    table = plan_data()["tables"]["I"]
+    return {"tables": {"I": {**table, "paper": paper}}}
+
+
+def table(**changes: object) -> dict[str, object]:
+    return {"tables": {"I": {**plan_data()["tables"]["I"], **changes}}}
+
+
+def label(text: str) -> dict[str, object]:
+    return {"rows": {**plan_data()["rows"], "x": {"label": text, "controller": "random"}}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (number(random={5: {"cover": [1, 2]}}), "table I, paper, random: unknown key 5: allowed"),
+        (number(random={"2": {"cover": [1, 2]}}), "unknown key '2': allowed are 2; did you mean 2"),
+        *(
+            (number(random={2: {"cover": [1, value]}}), "must be null or numbers from 0 to 1000000")
+            for value in (float("nan"), float("inf"), -1, 10**400, True, "1")
+        ),
+        ({"seed": 2**63}, "seed must be a whole number of at least 0, at most 9223372036854775807"),
+        ({"seed": -1}, "seed must be a whole number"),
+        (label("two\nlines"), "row x: label must be a text of one line, not empty"),
+        (label(" "), "row x: label must be a text of one line, not empty"),
+        (label("\x1b[0m"), "row x: label must be a text of one line, not empty"),
+        (table(caption=""), "table I: caption must be a text of one line, not empty"),
+        (table(scenes={"easy": "a\tb"}), "the label of easy must be a text of one line"),
+        (table(scenes={}), "table I: scenes must be at least one scene"),
+        (table(n_agents=[2, 2]), "n_agents must be a list of numbers of robots, each once"),
+        (table(rows=["random", "random"]), "rows must be a list of names, each once"),
+        (table(metrics=["cover", "cover"]), "metrics must be a list of names, each once"),
+    ],
+)
+def test_a_wrong_plan_is_one_line(changes, said):
+    with pytest.raises(PlanError) as caught:
+        parse_plan(plan_data(**changes))
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).isprintable()
+
+
+def test_the_largest_seed_of_a_plan_can_be_kept():
+    assert parse_plan(plan_data(seed=2**63 - 1)).seed == 2**63 - 1
+    assert held_out_seed(2**63 - 1) < 2**64
 
 
 def test_files_of_a_parcel_are_there_while_the_controller_is_made():

@@ -15,6 +15,7 @@ pytest.importorskip("ray", reason="the extra ray is not installed")
 import ray
 from ray.cluster_utils import Cluster
 
+from sb3_roles.evaluation.grid.crews import Parcel
 from sb3_roles.evaluation.grid.entrants import Entrant
 from sb3_roles.evaluation.grid.play import play
 from sb3_roles.evaluation.grid.ray_crew import RayCrew, RayError
@@ -76,21 +77,21 @@ def test_a_cluster_that_loses_a_machine_plays_the_same(cluster, tmp_path):
         "learned": [Entrant("learned", "/nowhere", learned=True, training_seed=1)],
     }
 
-    def files(entrant: Entrant) -> dict[str, bytes]:
-        return {"name": b"greedy"}
+    def pack(entrant: Entrant) -> Parcel:
+        return Parcel(entrant, {"name": b"greedy"} if entrant.learned else {})
 
     lines: list[str] = []
     store = RecordStore(tmp_path / "ray", lines.append)
     crew = Losing(cluster, node, 6, read, store)
     try:
         assert crew.size == 2
-        outcome = play(plan, entrants, store, read, report=lines.append, crew=crew, files=files)
+        outcome = play(plan, entrants, store, read, report=lines.append, crew=crew, pack=pack)
         assert cluster.list_all_nodes() == [cluster.head_node]
     finally:
         crew.close()
     assert outcome.failures == {"broken": "ZeroDivisionError: three steps are enough"}
     own = RecordStore(tmp_path / "own")
-    expected = play(plan, entrants, own, read, report=lambda _: None, files=files)
+    expected = play(plan, entrants, own, read, report=lambda _: None, pack=pack)
     assert_same_results(outcome.results, expected.results)
     learned = [ones[0] for (row, _), ones in outcome.results.items() if row == "learned"]
     assert {one.records.metadata["controller"] for one in learned} == {"GreedyController"}

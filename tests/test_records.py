@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -44,6 +46,22 @@ class WithRoles(RandomController):
 @pytest.fixture(scope="module")
 def recorded() -> EpisodeRecords:
     return run_episodes(WithRoles(), STOPPING, 40, held_out_seed(3), first_episode=10)
+
+
+def test_versions_are_of_what_a_controller_uses(monkeypatch):
+    """Whoever else has loaded OR-Tools in this process."""
+
+    class Routes(RandomController):
+        solutions = 20
+
+    monkeypatch.setitem(sys.modules, "ortools", SimpleNamespace(__version__="9.0"))
+    versions = [
+        run_episodes(one(), STOPPING, 1, held_out_seed(3)).metadata["versions"]
+        for one in (Routes, RandomController)
+    ]
+    assert versions[0].pop("ortools") == "9.0"
+    assert versions[0] == versions[1]
+    assert "numba" in versions[1]
 
 
 def assert_identical(first: EpisodeRecords, second: EpisodeRecords) -> None:

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import re
+from argparse import Namespace
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -26,14 +27,17 @@ from report_pages import (
     small_plan,
     small_tables,
     table_of,
+    tables_with_a_time,
 )
 
 from area_search.scenes import SCENES, Scene, get_scene
 from sb3_roles.evaluation.episodes import held_out_seed, run_episodes
+from sb3_roles.evaluation.grid.crews import Parcel
 from sb3_roles.evaluation.grid.entrants import Entrant
-from sb3_roles.evaluation.grid.plan import Column
-from sb3_roles.evaluation.report import page
-from sb3_roles.evaluation.report.summary import is_reached, printed_cells, summarize_tables
+from sb3_roles.evaluation.grid.plan import SCORES, Column
+from sb3_roles.evaluation.report import PAGE, page
+from sb3_roles.evaluation.report.printed import is_reached, printed_cells
+from sb3_roles.evaluation.report.summary import summarize_tables
 from sb3_roles.evaluation.report.traces import (
     NEVER,
     Trace,
@@ -41,8 +45,11 @@ from sb3_roles.evaluation.report.traces import (
     play_traces,
     record_traces,
 )
+from sb3_roles.zoo import table_outputs
 
 CONFIGS = Path(__file__).resolve().parent.parent / "zoo_configs"
+# What our side of a difference from the paper can rest on.
+SOURCES = {"paper", "released code", "measured", "inferred", "ours"}
 
 
 # Episodes
@@ -114,6 +121,51 @@ def test_who_and_where_is_recorded() -> None:
     assert {one.column for one in traces} == {HARD}
 
 
+def test_a_row_that_fails_is_left_out_of_the_player() -> None:
+    def failing(entrant: Entrant) -> Any:
+        if entrant.row == "greedy":
+            raise OSError("its folder is gone")
+        return make(entrant)
+
+    lines: list[str] = []
+    players = {name: ones for name, ones in entrants().items() if name != "oracle"}
+    traces = record_traces(small_plan(), players, failing, (0, 1), {EASY}, lines.append)
+    assert [one.entrant.row for one in traces] == ["greedy_assigned"] * 2 + ["hmappo"] * 2
+    assert lines == [
+        "playing 6 episodes for the player",
+        "greedy is left out of the player: its folder is gone",
+    ]
+
+
+def test_the_page_plays_what_the_tables_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The player's episodes come from the parcels, and not from a folder that may be gone."""
+    seen = []
+
+    def opened(entrant: Entrant) -> Any:
+        if entrant.learned:
+            seen.append(Path(entrant.source, "weights").read_bytes())
+        return make(entrant)
+
+    monkeypatch.setattr(table_outputs, "make_controller", opened)
+    plan = small_plan()
+    players = {name: ones for name, ones in entrants().items() if name != "oracle"}
+    parcels = {name: Parcel(ones[0]) for name, ones in players.items()}
+    parcels["hmappo"] = Parcel(players["hmappo"][0], {"weights": b"those of the tables"})
+    # A row without a parcel: the page is written all the same.
+    del parcels["greedy"]
+    made = table_outputs.Made(plan, players, {}, small_tables(plan), {}, {}, parcels)
+    lines: list[str] = []
+    table_outputs.write_page(Namespace(out=tmp_path, quick=False), made, lines.append)
+    assert seen == [b"those of the tables"]
+    elements = Elements()
+    elements.feed((tmp_path / PAGE).read_text(encoding="utf-8"))
+    rows = {one["row"] for one in data_of(elements)["traces"]["episodes"]}
+    assert rows == {"greedy_assigned", "hmappo"}
+    assert len(lines) == 2 and lines[1].startswith("greedy is left out of the player")
+
+
 def test_maps_beyond_bytes_are_refused() -> None:
     scene = Scene(name="wide", width=256, n_targets=10)
     with pytest.raises(ValueError, match=r"255 x 255 cells .* wide has 25 x 256"):
@@ -183,6 +235,16 @@ def test_what_counts_as_reached() -> None:
     assert not is_reached(number(33.0, paper=30.0, unit="steps"))
 
 
+def test_what_is_hardly_known_reaches_nothing_by_its_interval() -> None:
+    # Eight episodes, whose interval is wide: the means decide.
+    vague = number(40.0, paper=60.0, low=10.0, high=70.0)
+    assert is_reached(vague) and not is_reached(replace(vague, n_episodes=8))
+    assert is_reached(replace(vague, n_episodes=8, mean=61.0))
+    late = number(40.0, paper=30.0, low=28.0, high=50.0, unit="steps")
+    assert is_reached(late) and not is_reached(replace(late, n_episodes=19))
+    assert is_reached(replace(late, n_episodes=19, mean=29.0))
+
+
 def test_printed_numbers_come_by_the_size_of_their_difference() -> None:
     plan = small_plan()
     tables = small_tables(plan)
@@ -230,6 +292,57 @@ def test_sentences() -> None:
     assert len(points) == 6
 
 
+def test_a_time_that_is_never_reached_counts() -> None:
+    """It was played, it is not reached, and nothing is further away."""
+    plan = small_plan()
+    tables = tables_with_a_time(plan)
+    first = printed_cells(tables)[0]
+    assert (first.row, first.metric, first.played, first.ours) == (
+        "hmappo",
+        "time_e_paper",
+        True,
+        None,
+    )
+    assert not first.reached and first.difference is None
+    own = summarize_tables(plan, tables)[0]
+    assert own.head.startswith("Roles reaches 1 of 4 numbers")
+    assert "Time_E 0 of 1" in own.text
+    table = tables["I"]
+    rows = [replace(row, values={}) if row.name == "hmappo" else row for row in table.rows]
+    absent = {"I": replace(table, rows=tuple(rows))}
+    assert not printed_cells(absent)[-1].played
+    assert not any(one.head.startswith("Roles reaches") for one in summarize_tables(plan, absent))
+
+
+def test_the_bound_is_compared_on_the_same_episodes() -> None:
+    plan = small_plan()
+    *others, bound = small_tables(plan)["I"].rows
+    fewer = {key: replace(value, n_episodes=10) for key, value in bound.values.items()}
+
+    def heads(values: Any) -> list[str]:
+        tables = table_of(plan, [*others, replace(bound, values=values)])
+        return [one.head for one in summarize_tables(plan, tables)]
+
+    assert any(head.startswith("Knowing the map") for head in heads(bound.values))
+    assert not any(head.startswith("Knowing the map") for head in heads(fewer))
+
+
+def test_what_roles_change_is_said_with_its_seeds() -> None:
+    parts = small_plan()
+    rows = {**parts.rows, "mappo": replace(parts.rows["hmappo"], name="mappo", label="Plain")}
+    plan = replace(parts, rows=rows)
+    (ours,) = [row for row in small_tables(plan)["I"].rows if row.name == "hmappo"]
+    plain = row_of(plan, "mappo", {(EASY, "cover"): 40.0, (HARD, "cover"): 46.0})
+    points = {one.head: one for one in summarize_tables(plan, table_of(plan, [ours, plain]))}
+    # 45 against 40, and 48 against 46.
+    text = points["Roles covers 3.5 points more than Plain"].text
+    assert "Over 2 places, from +2.0 to +5.0, with 2 against 2 training seeds" in text
+    assert "reward for moves differs, too" in text
+    worse = row_of(plan, "mappo", {(EASY, "cover"): 50.0})
+    heads = [one.head for one in summarize_tables(plan, table_of(plan, [ours, worse]))]
+    assert "Roles covers 5.0 points less than Plain" in heads
+
+
 def test_sentences_without_results() -> None:
     plan = small_plan()
     empty = [row_of(plan, name, {}) for name in plan.rows]
@@ -274,12 +387,12 @@ def test_differences_are_well_formed() -> None:
     known = {"area", "what", "paper", "ours", "source", "switch", "holds"}
     for entry in entries():
         assert set(entry) <= known, entry
-        assert entry["source"] in page.SOURCES, entry
+        assert entry["source"] in SOURCES, entry
         assert all(entry[key].strip() for key in ("area", "what", "paper", "ours")), entry
     names = [(entry["area"], entry["what"]) for entry in entries()]
     assert len(set(names)) == len(names)
     assert page.deviations()[0].keys() == known - {"holds"}
-    assert {entry["source"] for entry in entries()} == set(page.SOURCES)
+    assert {entry["source"] for entry in entries()} == SOURCES
 
 
 # The file
@@ -377,6 +490,10 @@ def test_what_the_page_is_told(tmp_path: Path) -> None:
     assert hard == [{"printed": True, "paper": 100.0}, None, {"printed": True, "paper": 40.0}]
     assert [one and one["mean"] for one in table["rows"][0]["overall"][0]] == [None, None, 48.0]
     assert table["rows"][0]["seconds"] == [[2e-6, 4e-6]]
+    # One number for the row, the same as in the other forms of the table.
+    assert table["rows"][0]["decision"] == [3e-6] and table["rows"][0]["batch"] == 20
+    assert data["metrics"]["cover"]["short"] == "Covered"
+    assert set(data["metrics"]) == set(SCORES)
     source = data["figures"][0]["source"]
     assert base64.b64decode(source.removeprefix("data:image/svg+xml;base64,")).decode() == SVG
     assert data["facts"][1:] == [
@@ -405,6 +522,6 @@ def test_the_plan_of_the_project_has_a_page(tmp_path: Path) -> None:
     data = data_of(elements)
     assert [table["name"] for table in data["tables"]] == ["I", "II", "III", "IV", "V"]
     assert data["tables"][4]["teams"] == [4, 8, 15]
-    assert all(one["ours"] is None for one in data["printed"]) and len(data["printed"]) == 200
+    assert not any(one["played"] for one in data["printed"]) and len(data["printed"]) == 240
     assert data["summary"][-1]["head"] == "Not played yet"
     assert Column("hard", 4) in plan.tables["I"].columns and data["scenes"]["hard"] == "Hard"

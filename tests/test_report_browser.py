@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from report_pages import SVG, entrants, make, small_plan, small_tables
+from report_pages import SVG, entrants, make, small_plan, small_tables, tables_with_a_time
 
 from area_search import BatchedAreaSearch
 from area_search.scenes import get_scene
 from sb3_roles.evaluation.episodes import Player, held_out_seed, run_episodes
+from sb3_roles.evaluation.metrics import MEANINGS
 from sb3_roles.evaluation.report.page import write_report
 from sb3_roles.evaluation.report.traces import record_traces
 
@@ -396,7 +397,8 @@ def test_cells_say_what_they_are(page: Any) -> None:
         "95 % interval 59.0 to 61.0",
         "the paper prints 70",
         "20 episodes",
-        "2 µs to decide on a step of the team",
+        "2 µs to decide on a step",
+        "(a team\N{RIGHT SINGLE QUOTATION MARK}s share, up to 20 teams at once)",
     ):
         assert line in lines
     assert cells[0].get_attribute("aria-describedby") == "tip"
@@ -445,6 +447,29 @@ def test_head_and_honesty(page: Any) -> None:
     assert len(many(page, "#printed tbody tr")) == 3
     Select(one(page, "#printed-row")).select_by_value("greedy")
     assert len(many(page, "#printed tbody tr")) == 1
+
+
+def test_a_time_that_is_never_reached_is_a_dash_and_falls_short(page: Any, tmp_path: Path) -> None:
+    plan = small_plan()
+    path = tmp_path / "report.html"
+    write_report(path, plan, tables_with_a_time(plan), {}, {}, [], {}, False)
+    page.get(path.as_uri())
+    first = texts(page, "#printed tbody tr")[0].split("\t")
+    dash = "\N{EN DASH}"
+    assert first == ["Roles", "Easy, 2", "Time_E (paper)", "39", dash, dash, "I"]
+    assert len(many(page, "#printed tbody tr")) == 8
+    hint = next(text for text in texts(page, "#honesty .hint") if "numbers are printed" in text)
+    assert "8 numbers are printed; 8 of them were played, and ours falls short of 4." in hint
+    one(page, "#printed-short").click()
+    assert len(many(page, "#printed tbody tr")) == 4
+
+
+def test_what_metrics_mean(page: Any) -> None:
+    meanings = dict(zip(texts(page, ".meanings dt"), texts(page, ".meanings dd"), strict=True))
+    assert set(meanings) == set(MEANINGS)
+    for name, text in meanings.items():
+        said = text.replace("\N{NO-BREAK SPACE}", " ")
+        assert said == MEANINGS[name].text[0].upper() + MEANINGS[name].text[1:] + "."
 
 
 def test_a_phone(page: Any) -> None:

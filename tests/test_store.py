@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from grids import assert_same
 
@@ -140,6 +141,30 @@ def test_a_file_that_is_not_what_it_should_be_is_put_aside(spoil, said, store, b
     assert files(store) == ["2-4.parquet.damaged", "2-4.parquet.damaged-2"]
 
 
+@pytest.mark.parametrize(("number", "stops"), [(24, True), (5, True), (12, True), (13, False)])
+def test_what_can_not_be_read_now_is_not_called_damaged(
+    number, stops, store, block, lines, monkeypatch
+):
+    series, span = series_of(), Span(2, 4)
+    store.write(series, span, block)
+    path = store.path(series, span)
+
+    def refuse(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(parquet, "read_table", refuse)
+        if stops:
+            with pytest.raises(OSError, match=os.strerror(number)) as caught:
+                store.read(series, span)
+            assert (caught.value.errno, caught.value.filename) == (number, str(path))
+        else:
+            assert store.read(series, span) is None
+            assert lines == [f"{path}: {os.strerror(number)}; it is played again"]
+    assert files(store) == ["2-4.parquet"]
+    assert_same(store.read(series, span), block)
+
+
 def test_a_survey_leaves_damaged_files_where_they_are(store, block, lines):
     series, span = series_of(), Span(2, 4)
     store.write(series, span, block)
@@ -183,8 +208,9 @@ def test_a_disk_that_refuses_leaves_nothing_behind(store, block, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space left") as caught:
         store.write(series_of(), Span(2, 4), block)
+    assert caught.value.filename == str(store.path(series_of(), Span(2, 4)))
     assert files(store) == []
 
 

@@ -129,7 +129,7 @@ def results():
     for column, shift in ((HARD, 0.0), (EASY, 0.05)):
         found["random", column] = scripted("random", recorded(column, ends(0.2 + shift)))
         found["greedy", column] = scripted("greedy", recorded(column, ends(1.1 + shift)))
-        found["vrpc", column] = scripted("vrpc", recorded(column, ends(0.5 + shift, n=8)))
+        found["vrpc", column] = scripted("vrpc", recorded(column, ends(0.5 + shift, n=20)))
         found["oracle", column] = scripted("oracle", recorded(column, ends(1.3), seconds=2.6e-3))
         runs = [recorded(column, ends(mean + shift)) for mean in (0.70, 0.72, 0.80)]
         found["mappo", column] = trained("mappo", runs)
@@ -236,9 +236,9 @@ def test_the_order_of_rows_changes_nothing(plan, results, tables):
 
 def test_times(plan):
     steep = np.clip(np.arange(1, HORIZON + 1) / 4, 0, 1)
-    flat = recorded(HARD, np.full(10, 0.5))
-    early = recorded(HARD, np.full(10, 1.2), np.array([1.0] * 5 + [0.5] * 5), curve=steep)
-    late = recorded(HARD, np.full(10, 1.2))
+    flat = recorded(HARD, np.full(20, 0.5))
+    early = recorded(HARD, np.full(20, 1.2), np.array([1.0] * 10 + [0.5] * 10), curve=steep)
+    late = recorded(HARD, np.full(20, 1.2))
     results = {
         ("random", HARD): scripted("random", flat),
         ("greedy", HARD): scripted("greedy", early),
@@ -267,8 +267,8 @@ def test_times(plan):
 
 def test_nobody_who_never_gets_there_is_first(plan):
     results = {
-        ("random", HARD): scripted("random", recorded(HARD, np.full(10, 0.5))),
-        ("greedy", HARD): scripted("greedy", recorded(HARD, np.full(10, 0.6))),
+        ("random", HARD): scripted("random", recorded(HARD, np.full(20, 0.5))),
+        ("greedy", HARD): scripted("greedy", recorded(HARD, np.full(20, 0.6))),
     }
     table = make_tables(plan, results)["V"]
     assert not any(_value(row, HARD, "time_e_paper").best for row in table.rows)
@@ -312,7 +312,7 @@ def test_durations(seconds, text):
 def test_notes_are_made_of_the_data(tables):
     table = tables["I"]
     assert noted(table, "held-out stream of seed 7").startswith("30 episodes")
-    assert "VRPC 8" in noted(table, "Fewer episodes")
+    assert "VRPC 20" in noted(table, "Fewer episodes")
     assert "ECC" in noted(table, "One training seed", "over episodes only")
     assert "75 of 100" in noted(table, "With 3 seeds", "MAPPO")
     assert "GNN" in noted(table, "Not trained yet")
@@ -325,6 +325,29 @@ def test_notes_are_made_of_the_data(tables):
     noted(table, "Not played everywhere", "ECC")
     assert not any("Quick" in note or "plan" in note for note in table.notes)
     assert not any("One training seed" in note for note in tables["V"].notes)
+
+
+def test_the_decision_time_says_of_how_many_teams_it_is_a_share(plan, results, tables):
+    rows = rows_of(tables["I"])
+    assert (rows["greedy"].batch, rows["vrpc"].batch, rows["gnn"].batch) == (30, 20, 0)
+    note = noted(tables["I"], "Decision: median time")
+    assert "30 teams for Random & co_1, Greedy, MAPPO, ECC, Oracle; 20 teams for VRPC" in note
+    assert "single team takes many times its share" in note
+    slow = scripted("greedy", recorded(EASY, ends(1.1), seconds=3e-3))
+    row = rows_of(make_tables(plan, {**results, ("greedy", EASY): slow})["I"])["greedy"]
+    # The median of the scenes, in all forms of the table.
+    assert row.decision_over([HARD, EASY]) == pytest.approx(2e-3)
+    assert row.decision_over([Column("hard", 8)]) is None
+
+
+def test_marks_need_enough_episodes_and_seeds_to_speak_for_a_method(plan, results, tables):
+    note = noted(tables["I"], "With this few training seeds")
+    assert "18 % with 3 against 3" in note
+    assert not any("fewer than 20 episodes" in note for note in tables["I"].notes)
+    few = [recorded(HARD, ends(0.5, n=19))]
+    table = make_tables(plan, {**results, ("vrpc", HARD): scripted("vrpc", few[0])})["I"]
+    noted(table, "Bold:", "not where one has fewer than 20 episodes")
+    assert not any(_value(row, HARD).best for row in table.rows)
 
 
 def test_fewer_episodes_than_the_plan_has(results, plan):
@@ -392,6 +415,7 @@ def test_numbers_come_back_from_csv(tables):
     found = dict(zip(keys, lines, strict=True))
     oracle = found["I", "oracle", "4", "hard", "cover"]
     assert float(oracle["decision_us"]) == pytest.approx(2600)
+    assert oracle["batch"] == "30"
     dash = found["I", "vrpc", "4", "hard", "explo_paper"]
     assert (dash["printed"], dash["paper"]) == ("true", "")
     absent = found["I", "gnn", "4", "hard", "cover"]
@@ -447,9 +471,9 @@ def test_markdown_says_common_notes_once(tables):
 
 
 def test_markdown_escapes(plan, results):
-    rows = {**plan.rows, "random": replace(plan.rows["random"], label="a|b*c<d")}
+    rows = {**plan.rows, "random": replace(plan.rows["random"], label="a|b*c<d[e](f)")}
     text = to_markdown(make_tables(replace(plan, rows=rows), results))
-    assert r"a\|b\*c\<d" in text
+    assert r"a\|b\*c\<d\[e](f)" in text
     assert {len(line) for line in markdown_lines(text)} == {3, 5}
 
 

@@ -26,6 +26,7 @@ from sb3_roles.evaluation.records import read_records
 from sb3_roles.zoo import tables
 from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import config_file, read_yaml, write_yaml
+from sb3_roles.zoo.entrants import pack
 from sb3_roles.zoo.models import complete
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.row_runs import RunFinder, config_of_row, training_command
@@ -92,6 +93,14 @@ def assert_same_outputs(first: Path, second: Path) -> None:
 
 
 def test_tables_are_written_and_played_once(tell, plan, tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    # A killed writer, one that is at work, and somebody else's file.
+    stale, *kept = (folder / f"{name}.partial" for name in ("tables.md.7", "tables.md.8", "mine"))
+    for path in (stale, *kept):
+        path.write_bytes(b"half")
+    for path in (stale, kept[1]):
+        os.utime(path, (1e9, 1e9))
     code, out, err = tell("--plan", plan, "-o", "out", "--jobs", "1")
     assert code == 0
     assert [line for line in out if line.startswith("wrote ")] == [
@@ -103,6 +112,8 @@ def test_tables_are_written_and_played_once(tell, plan, tmp_path):
     assert err[-1].endswith("4 of 4 cells")
     found = records_below(tmp_path / "out")
     assert len(found) == 2 * 2 * 3
+    assert not stale.exists()
+    assert all(path.exists() for path in kept)
     cover = {
         (row["row"], row["scene"]): float(row["mean"])
         for row in numbers_of(tmp_path / "out")
@@ -164,16 +175,28 @@ def test_the_quick_form_of_the_papers_tables_is_plausible(tell, tmp_path):
 def test_a_dry_run_counts_and_writes_nothing(tell, plan, tmp_path):
     code, out, err = tell("--plan", plan, "--dry-run", "--jobs", "2", "--rows", "random")
     assert (code, err) == (0, [])
-    assert out[0].startswith("random: 0 blocks are there, 6 are missing, about ")
-    assert out[-1].endswith(" with --jobs 2")
+    assert out == [
+        "random: 0 blocks are there, 6 are missing, time not known yet",
+        "time not known yet with --jobs 2",
+    ]
     assert os.listdir(tmp_path) == ["plan.yml"]
     tell("--plan", plan, "--rows", "random", "--episodes", "3", "--jobs", "1")
     (cut, _) = tmp_path.rglob("*.parquet")
     cut.write_bytes(cut.read_bytes()[:-1])
     code, out, err = tell("--plan", plan, "--dry-run", "--rows", "random", "--episodes", "3")
-    assert out[0].startswith("random: 1 blocks are there, 1 are missing")
+    assert out[0].startswith("random: 1 blocks are there, 1 are missing, about ")
+    assert out[0].endswith(" on one CPU")
+    assert out[1].startswith("about ")
     assert len(err) == 1
     assert cut.is_file()
+    # Of greedy nothing is known.
+    _, out, _ = tell("--plan", plan, "--dry-run", "--episodes", "3")
+    assert out[1] == "greedy: 0 blocks are there, 2 are missing, time not known yet"
+    assert out[2].startswith("more than ")
+    for wrong in ("plan.yml", "plan.yml/below"):
+        code, out, err = tell("--plan", plan, "--dry-run", "-o", wrong)
+        assert (code, out) == (2, [])
+        assert "plan.yml is no folder" in err[0]
 
 
 WRONG = [
@@ -184,6 +207,11 @@ WRONG = [
     (["--figures", "x"], "unknown figure 'x'"),
     (["--plan", "no.yml"], "no.yml: No such file"),
     (["--plan", "wrong.yml"], "wrong.yml: row random: "),
+    (["--plan", "algo.yml"], "algo.yml: row x: unknown algorithm 'gnm'"),
+    (["--plan", "algo.yml"], "did you mean 'gnn'?"),
+    (["--plan", "conf.yml"], "conf.yml: row x: unknown conf 'ecc_covrage'"),
+    (["--plan", "conf.yml"], "did you mean 'ecc_coverage'?"),
+    (["--plan", "params.yml"], "params.yml: row x: unknown key 'gama'"),
     (["--episodes", "0"], "from 1 to"),
     (["--jobs", "0"], "from 1 to"),
     (["--jobs", "2", "--ray", "local"], "not allowed with"),
@@ -193,7 +221,7 @@ WRONG = [
     (["--runs", "hmappo=."], "config.yml: No such file"),
     (["--runs", "random=."], "unknown learned row 'random'"),
     (["-o", "/proc/none"], "/proc/none"),
-    (["-o", "plan.yml"], "plan.yml: File exists"),
+    (["-o", "plan.yml"], "--out: plan.yml is no folder"),
     (["--tabels", "I"], "did you mean '--tables'?"),
 ]
 
@@ -201,7 +229,14 @@ WRONG = [
 @pytest.mark.parametrize(("args", "said"), WRONG)
 def test_bad_input_is_one_line_before_anything_is_played(args, said, tell, tmp_path):
     rows = {**plan_data()["rows"], "hmappo": {"label": "x", "algo": "hmappo"}}
-    (tmp_path / "wrong.yml").write_text(yaml.safe_dump(plan_data(rows={"random": {}})))
+    # No table needs the rows x: they are checked all the same.
+    for name, row in {
+        "wrong": {"random": {}},
+        "algo": {**rows, "x": {"label": "x", "algo": "gnm"}},
+        "conf": {**rows, "x": {"label": "x", "algo": "ecc", "conf": "ecc_covrage"}},
+        "params": {**rows, "x": {"label": "x", "algo": "ecc", "params": {"gama": 1}}},
+    }.items():
+        (tmp_path / f"{name}.yml").write_text(yaml.safe_dump(plan_data(rows=row)))
     plan = write_plan(tmp_path, rows=rows)
     code, out, err = tell(*([] if "--plan" in args else ["--plan", plan]), *args)
     assert (code, out) == (2, [])
@@ -225,6 +260,9 @@ def test_a_row_that_can_not_play_is_left_out(tell, tmp_path, monkeypatch):
     assert code == tables.EXIT_ROWS_FAILED == 3
     assert err[0] == "vrpc is left out: install sb3_roles[vrp] for vrpc"
     assert err[-1] == "left out: vrpc"
+    code, _, err = tell("--plan", plan, "--dry-run")
+    assert code == tables.EXIT_ROWS_FAILED
+    assert err == ["vrpc is left out: install sb3_roles[vrp] for vrpc"]
     assert {row["row"] for row in numbers_of(tmp_path / "results") if row["mean"]} == {"random"}
 
 
@@ -314,6 +352,31 @@ def test_runs_of_one_row_have_the_same_length(tmp_path):
     )
 
 
+def test_a_run_of_another_algorithm_plays_for_no_row(tell, tmp_path):
+    row = row_of("mappo")
+    rows = {"learned": {"label": "Learned", "algo": "hmappo"}, **plan_data()["rows"]}
+    run = make_run(tmp_path / "logs", row, 1, 500, seed=1)
+    plan = write_plan(tmp_path, rows=rows)
+    code, _, err = tell("--plan", plan, "--runs", f"learned={run}")
+    assert code == 2
+    assert err == [
+        f"sb3-roles tables: error: argument --runs: {run} is a run of mappo, the row learned is of "
+        "hmappo"
+    ]
+
+
+def test_the_budget_is_that_of_the_weights_that_play(tmp_path):
+    row = row_of("mappo")
+    run = make_run(tmp_path, row, 1, 500, seed=1)
+    (found,) = RunFinder(tmp_path, lambda _: None).find(row)
+    entrant = found.entrant(row)
+    # The training goes on meanwhile.
+    CheckpointFolder(run / "checkpoints").save(700, manifest={"env_steps": 700}, policy={})
+    parcel = pack(entrant)
+    assert (entrant.env_steps, parcel.entrant.env_steps) == (500, 700)
+    assert sorted(parcel.files) == ["checkpoints/step_000000000700.ckpt", "config.yml"]
+
+
 def test_a_run_that_can_not_be_read_stops_nothing(tmp_path):
     row = row_of("mappo")
     make_run(tmp_path, row, 1, 500, seed=1)
@@ -383,6 +446,20 @@ def test_a_row_without_a_run_says_how_to_train_it_and_then_plays(tell, tmp_path)
     assert err[0] == "learned: 1 run of 8 joint steps, seed 1"
     seeds = {row["n_seeds"] for row in numbers_of(tmp_path / "results") if row["row"] == "learned"}
     assert seeds == {"1"}
+    # Of another configuration, or twice.
+    other = moved / "hmappo" / "area-search-v0_7"
+    shutil.copytree(moved / "hmappo" / "area-search-v0_2", other)
+    code, _, err = tell(*options, "--runs", f"learned={moved}/hmappo/*_[27]")
+    assert code == 2
+    assert err[-1].endswith(f"argument --runs: {other}: training seed 1 is there already")
+    config = read_yaml(other / "config.yml")
+    write_yaml(other / "config.yml", {**config, "gamma": 0.5})
+    code, _, err = tell(*options, "--runs", f"learned={other}", "--dry-run")
+    assert code == 0
+    assert err[:2] == [
+        "learned: 1 run of 8 joint steps, seed 1",
+        "learned: named by hand, its configuration is not the row's",
+    ]
     # It is damaged: the others are played all the same.
     for path in (moved / "hmappo" / "area-search-v0_2" / "checkpoints").iterdir():
         path.write_bytes(b"")
@@ -538,6 +615,13 @@ def test_a_plan_is_read_in_parts(tmp_path):
         ("planner", "easy"),
         ("oracle", "easy"),
     }
-    args.rows = ["random"]
+    args.tables = args.rows = args.scenes = None
+    args.figures = ["time_e"]
+    plan = tables.read_plan(args)
+    assert (list(plan.tables), list(plan.figures)) == ([], ["time_e"])
+    args.tables = ["I"]
+    plan = tables.read_plan(args)
+    assert (list(plan.tables), list(plan.figures)) == (["I"], ["time_e"])
+    args.tables, args.rows, args.scenes, args.figures = ["V"], ["random"], ["easy"], None
     with pytest.raises(UsageError, match="no table or figure has any"):
         tables.read_plan(args)

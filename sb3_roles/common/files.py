@@ -23,8 +23,11 @@ def write_atomically(path: Path, content: bytes) -> None:
     try:
         partial.write_bytes(content)
         os.replace(partial, path)
-    except OSError:
+    except OSError as error:
         partial.unlink(missing_ok=True)
+        if error.filename is None:
+            # A full disk is not said to be that of any file.
+            error.filename = str(path)
         raise
 
 

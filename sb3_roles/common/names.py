@@ -6,16 +6,16 @@ import difflib
 from collections.abc import Iterable
 
 
-def closest(what: str, name: object, allowed: Iterable[str]) -> str:
+def closest(what: str, name: object, allowed: Iterable[object]) -> str:
     """One line for an unknown name: what is allowed, and the closest match.
 
     :param what: the kind of thing that was named
     :param name: the unknown name
-    :param allowed: the known names
+    :param allowed: the known names, or numbers
     """
-    known = list(allowed)
+    known = {str(one): one for one in allowed}
     close = difflib.get_close_matches(str(name), known, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
+    hint = f"; did you mean {known[close[0]]!r}?" if close else ""
     return f"unknown {what} {name!r}: allowed are {', '.join(known) or 'none'}{hint}"
 
 

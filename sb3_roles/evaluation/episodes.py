@@ -113,8 +113,11 @@ def describe(controller: Controller, scene: Scene, name: str | None = None) -> d
     }
 
 
-def _versions() -> dict[str, str]:
-    loaded = {name: sys.modules[name].__version__ for name in _VERSIONS if name in sys.modules}
+def _versions(controller: Controller) -> dict[str, str]:
+    # Loaded or not: records must not tell who else has played in this process.
+    routes_of_ortools = getattr(controller, "solutions", 0) > 0
+    names = (*_VERSIONS, "ortools") if routes_of_ortools else _VERSIONS
+    loaded = {name: sys.modules[name].__version__ for name in names if name in sys.modules}
     return {"python": platform.python_version(), **loaded}
 
 
@@ -221,7 +224,8 @@ def run_episodes(
         _play(player, batch, records, rows)
     records.timing.update(seconds=time.perf_counter() - start, batch_size=int(batch_size))
     names = [] if player.roles is None else list(getattr(controller, "role_names", ()))
-    records.metadata.update(metadata, seed=int(seed), role_names=names, versions=_versions())
+    records.metadata.update(metadata, seed=int(seed), role_names=names)
+    records.metadata.update(versions=_versions(controller))
     return records
 
 

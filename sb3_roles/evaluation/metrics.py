@@ -8,7 +8,7 @@ covered. The paper prints the first as exploration.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,53 @@ NAMES = (
     "length",
 )
 """All metrics, in the order of the reports; ``cover_bound`` only where the controller knows it."""
+
+
+class Meaning(NamedTuple):
+    """What readers are told of a metric.
+
+    :param short: a word or two, for the head of a column
+    :param label: what it is called, with its name and unit
+    :param text: what it is, without a full stop
+    """
+
+    short: str
+    label: str
+    text: str
+
+
+MEANINGS = {
+    "explo_paper": Meaning(
+        "Explored (paper)",
+        "Explored, paper's count (explo_paper), %",
+        "what the paper prints as exploration: cells newly seen from step 1 on, obstacles included "
+        "and the view at the start excluded, over the free cells; it can exceed 100 %, and a "
+        "printed 100 stands for 100 or more",
+    ),
+    "explo_true": Meaning(
+        "Explored (true)",
+        "Truly explored (explo_true), %",
+        "the share of the free cells that was seen, the start included; never above 100 %",
+    ),
+    "cover": Meaning(
+        "Covered",
+        "Targets covered (cover), %",
+        "the share of the targets that a robot stepped on from step 1 on",
+    ),
+    "time_e_paper": Meaning(
+        "Time_E (paper)",
+        "Time to 90 % (time_e_paper), steps",
+        "the first step, counted from 0, at which the mean curve of explo_paper exceeds 90 %; a "
+        "dash where it never does",
+    ),
+    "t90_true": Meaning(
+        "t90 (true)",
+        "Time to 90 % (t90_true), steps",
+        "the first step, counted from 0, with explo_true of at least 90 %, mean over the episodes "
+        "that get there, whose share stands beside it",
+    ),
+}
+"""The metrics of tables and figures."""
 _BLOCK = 4_000_000
 
 

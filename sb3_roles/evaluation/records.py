@@ -66,6 +66,19 @@ class RecordsError(ValueError):
     """A file that holds no sound records, or records that fit no file; one line."""
 
 
+class UnreadableError(RecordsError):
+    """A file that could not be read, so that nothing is known of what it holds.
+
+    :param path: of the file
+    :param error: why
+    """
+
+    def __init__(self, path: str | Path, error: OSError | MemoryError) -> None:
+        self.error = error
+        why = getattr(error, "strerror", None) or f"not enough memory: {_short_line(error)}"
+        super().__init__(f"{path}: {why}")
+
+
 # Without eq=False the generated comparison would ask for the truth value of whole arrays.
 @dataclass(frozen=True, eq=False)
 class EpisodeRecords:
@@ -78,8 +91,8 @@ class EpisodeRecords:
     numbers of the episodes: it does not depend on how many teams were simulated together.
 
     :param metadata: JSON values; those of :func:`describe`, and ``seed`` of the stream,
-        ``role_names`` (empty without roles) and ``versions`` of python, numpy, numba and, where it
-        was loaded, torch
+        ``role_names`` (empty without roles) and ``versions`` of python, numpy, numba, where it was
+        loaded torch, and of OR-Tools if the controller uses it
     :param episode: int64 (E,), number of the episode in the stream of the seed
     :param length: int64 (E,), joint steps until the episode ended
     :param counts: int32 (E, horizon) each, counted from the start of the episode. ``seen``: cells
@@ -226,8 +239,9 @@ def read_records(path: str | Path) -> EpisodeRecords:
 
     :param path: the file
     :return: the records, equal in every array and value to those that were written
-    :raises RecordsError: naming the file, if there is none, or it is damaged, of another format
-        version, or no file of records at all
+    :raises UnreadableError: if there is no file, or the system does not let it be read
+    :raises RecordsError: naming the file, if it is damaged, of another format version, or no file
+        of records at all
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -236,8 +250,9 @@ def read_records(path: str | Path) -> EpisodeRecords:
         with open(path, "rb") as file:
             table = pq.read_table(file, page_checksum_verification=True)
     except (OSError, pa.ArrowException) as error:
-        if isinstance(error, OSError) and error.strerror:
-            raise RecordsError(f"{path}: {error.strerror}") from None
+        # Of damage, Arrow raises an OSError that has no number.
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.strerror):
+            raise UnreadableError(path, error) from None
         raise RecordsError(f"{path}: damaged, or no Parquet file: {_short_line(error)}") from error
     text = (table.schema.metadata or {}).get(_KEY)
     if text is None:

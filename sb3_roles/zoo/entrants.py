@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from sb3_roles.zoo.row_runs import (
     Report,
     RunFinder,
     describe_runs,
+    fits,
     named_runs,
     newest_checkpoint,
     training_command,
@@ -24,6 +26,7 @@ from sb3_roles.zoo.run_folder import CHECKPOINTS
 
 if TYPE_CHECKING:
     from sb3_roles.baselines.base import Controller
+    from sb3_roles.evaluation.grid.crews import Parcel
     from sb3_roles.evaluation.grid.plan import Figure, Plan, Table
 
 
@@ -44,27 +47,37 @@ def make_controller(entrant: Entrant) -> Controller:
     return loaded.controller(deterministic=not entrant.drawn, communicate=True)
 
 
-def run_files(entrant: Entrant) -> dict[str, bytes]:
+def pack(entrant: Entrant) -> Parcel:
     """Read what :func:`make_controller` needs of a run folder.
 
-    :param entrant: a learned one
-    :return: path within the folder -> content; the checkpoint holds the weights alone
+    :param entrant: see ``Entrant``
+    :return: of a learned entrant with its configuration and its newest weights, without the rest of
+        the checkpoint. The training may have gone on since the run was found: ``env_steps`` are
+        those of the weights
     :raises UsageError: if there is no sound checkpoint
+    :raises CheckpointError: if it states wrong numbers of steps
     :raises OSError: if a file can not be read
     """
     from sb3_roles.common.checkpoint import write_checkpoint
+    from sb3_roles.evaluation.grid.crews import Parcel
+    from sb3_roles.evaluation.grid.store import named
+    from sb3_roles.zoo.models import steps_of
 
+    if not entrant.learned:
+        return Parcel(entrant)
     run = Path(entrant.source)
     path, checkpoint = newest_checkpoint(run)
-    steps = {key: checkpoint.manifest.get(key, 0) for key in ("env_steps", "agent_steps")}
+    steps = {key: steps_of(checkpoint, key) for key in ("env_steps", "agent_steps")}
     with tempfile.TemporaryDirectory(prefix="sb3_roles-") as folder:
         weights = Path(folder, path.name)
-        write_checkpoint(weights, steps, checkpoint.policy)
+        with named(weights):
+            write_checkpoint(weights, steps, checkpoint.policy)
         content = weights.read_bytes()
-    return {
+    files = {
         CONFIG_FILE: (run / CONFIG_FILE).read_bytes(),
         f"{CHECKPOINTS}/{path.name}": content,
     }
+    return Parcel(replace(entrant, env_steps=steps["env_steps"]), files)
 
 
 def find_entrants(
@@ -90,6 +103,8 @@ def find_entrants(
             continue
         if name in named:
             report(f"{name}: {describe_runs(named[name])}")
+            if not all(fits(run, row) for run in named[name]):
+                report(f"{name}: named by hand, its configuration is not the row's")
         chosen = named[name] if name in named else finder.find(row)
         if not chosen:
             report(f"{name} has no run in {logs}: {training_command(row, logs)}")

@@ -13,6 +13,13 @@ from sb3_roles._version import __version__
 from sb3_roles.zoo.options import UsageError
 
 
+def usable_cores() -> int:
+    """Return how many CPUs this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def describe_machine() -> dict[str, Any]:
     """Describe what the measurement runs on; call it before the work, for the load average.
 
@@ -27,11 +34,10 @@ def describe_machine() -> dict[str, Any]:
         cpu = names[0] if names else cpu
     except OSError:
         pass  # not Linux
-    affinity = getattr(os, "sched_getaffinity", None)
     return {
         "cpu": cpu,
         "cores": os.cpu_count(),
-        "usable_cores": len(affinity(0)) if affinity else os.cpu_count(),
+        "usable_cores": usable_cores(),
         "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),
         "numpy": version("numpy"),

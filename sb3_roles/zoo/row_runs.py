@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_roles.common.names import closest
+from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import (
     CONFIG_FILE,
+    ConfigError,
     config_file,
     load_settings,
     merge,
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.plan import Plan, Row
 
 LOGS = Path("logs")
+PLAN = "tables"
+"""Stem of the plan's file, which is beside the configurations."""
 # Two runs that differ in these alone are runs of one configuration.
 _FREE = ("seed", "n_timesteps", "vec_env")
 _N_SEEDS = 3
@@ -107,11 +111,20 @@ def config_of_row(row: Row) -> dict[str, Any]:
     """Return the configuration that a run of a learned row has.
 
     :param row: a learned one
-    :raises ConfigError: if its file or its parameters are wrong
+    :raises ConfigError: naming the row, if its algorithm, its file or its parameters are wrong
     """
     assert row.algo is not None
-    settings = load_settings(row.algo, AREA_SEARCH, config_file(row.conf or row.algo))
-    return resolve(row.algo, AREA_SEARCH, merge(settings, row.params))
+    try:
+        if row.algo not in ALGORITHMS:
+            raise ConfigError([closest("algorithm", row.algo, ALGORITHMS)])
+        conf = row.conf or row.algo
+        known = sorted({path.stem for path in config_file(conf).parent.glob("*.yml")} - {PLAN})
+        if conf not in known:
+            raise ConfigError([closest("conf", conf, known)])
+        settings = load_settings(row.algo, AREA_SEARCH, config_file(conf))
+        return resolve(row.algo, AREA_SEARCH, merge(settings, row.params))
+    except ConfigError as error:
+        raise ConfigError(f"row {row.name}: {line}" for line in error.lines) from None
 
 
 def training_command(row: Row, logs: Path = LOGS) -> str:
@@ -140,6 +153,16 @@ def training_command(row: Row, logs: Path = LOGS) -> str:
 def _relative(path: Path) -> str:
     here = Path.cwd()
     return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
+def fits(run: Run, row: Row) -> bool:
+    """Whether a run has the configuration of a row.
+
+    :param run: of the row's algorithm
+    :param row: a learned one
+    :raises ConfigError: if the row's configuration is wrong
+    """
+    return run.method == _method(config_of_row(row))
 
 
 class RunFinder:
@@ -232,12 +255,13 @@ def describe_runs(runs: Sequence[Run]) -> str:
 
 
 def named_runs(texts: Sequence[str], plan: Plan) -> dict[str, list[Run]]:
-    """Read ``--runs ROW=RUN``: runs that play for a row, whatever their configuration.
+    """Read ``--runs ROW=RUN``: runs that play for a row, whatever else their configuration says.
 
     :param texts: RUN is a run folder, or a pattern of some
     :param plan: whose rows may be named
     :return: row -> its runs, each once
-    :raises UsageError: if there is no such row or run, or it is not of area search
+    :raises UsageError: if there is no such row or run, it is not of area search or of the row's
+        algorithm, or there are two of one training seed, which are no two samples
     """
     learned = [name for name, row in plan.rows.items() if row.learned]
     found: dict[str, dict[Path, Run]] = {}
@@ -254,7 +278,20 @@ def named_runs(texts: Sequence[str], plan: Plan) -> dict[str, list[Run]]:
             config = read_run_config(folder)
             if config["env"] != AREA_SEARCH:
                 raise UsageError(f"argument --runs: {folder} is not of {AREA_SEARCH}")
+            algo = plan.rows[name].algo
+            if config["algo"] != algo:
+                raise UsageError(
+                    f"argument --runs: {folder} is a run of {config['algo']}, the row {name} is of "
+                    f"{algo}"
+                )
             run = Run(folder, config)
             _ = run.env_steps  # There are weights.
-            found.setdefault(name, {})[folder.resolve()] = run
+            own = found.setdefault(name, {})
+            if folder.resolve() in own:
+                continue
+            if run.seed in [other.seed for other in own.values()]:
+                raise UsageError(
+                    f"argument --runs: {folder}: training seed {run.seed} is there already"
+                )
+            own[folder.resolve()] = run
     return {name: list(runs.values()) for name, runs in found.items()}

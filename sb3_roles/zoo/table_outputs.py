@@ -13,15 +13,16 @@ from typing import Any, NamedTuple
 from sb3_roles._version import __version__
 from sb3_roles.common.durations import long_duration
 from sb3_roles.common.files import write_atomically
+from sb3_roles.evaluation.grid.crews import Parcel
 from sb3_roles.evaluation.grid.entrants import Entrant, Entrants, Results
 from sb3_roles.evaluation.grid.plan import Plan
 from sb3_roles.evaluation.grid.play import Outcome
 from sb3_roles.evaluation.grid.store import Report
+from sb3_roles.evaluation.report import PAGE
 from sb3_roles.evaluation.tables.model import TableResult, make_tables
 from sb3_roles.evaluation.tables.writers import to_csv, to_latex, to_markdown
 from sb3_roles.zoo.entrants import make_controller
 from sb3_roles.zoo.run_folder import source_commit
-from sb3_roles.zoo.tables import PAGE
 
 FIGURES = "figures"
 
@@ -35,6 +36,7 @@ class Made(NamedTuple):
     :param tables: by name
     :param figures: name -> caption, of the figures that were drawn
     :param facts: about the making, for readers
+    :param parcels: row -> what its first entrant was made of when it played
     :param code: exit code of the command
     """
 
@@ -44,6 +46,7 @@ class Made(NamedTuple):
     tables: Mapping[str, TableResult]
     figures: Mapping[str, str]
     facts: Mapping[str, Any]
+    parcels: Mapping[str, Parcel]
     code: int = 0
 
 
@@ -73,21 +76,30 @@ def write_all(
     }
     tables = _write_tables(args, plan, outcome.results)
     figures = _draw(args, plan, outcome.results, logs, tell)
-    return Made(plan, played, outcome.results, tables, figures, _facts(seconds))
+    facts = _facts(seconds)
+    return Made(plan, played, outcome.results, tables, figures, facts, outcome.parcels)
 
 
-def write_page(args: Namespace, made: Made) -> None:
-    """Write the report.
+def write_page(args: Namespace, made: Made, tell: Report = print) -> None:
+    """Write the report, with a few episodes that the weights of the tables play once more.
 
     :param args: parsed arguments
     :param made: what :func:`write_all` returned
+    :param tell: takes lines: how many episodes are played, and rows that can not play them
+    :raises OSError: if the file can not be written
     """
     from sb3_roles.evaluation.report.page import write_report
     from sb3_roles.evaluation.report.traces import record_traces
 
     path, folder = args.out / PAGE, args.out / FIGURES
     images = {name: (folder / f"{name}.svg").read_text(encoding="utf-8") for name in made.figures}
-    traces = record_traces(made.plan, made.entrants, make_controller)
+    traces = record_traces(
+        made.plan,
+        made.entrants,
+        # Not from its folder, which may hold other weights by now, or be gone.
+        lambda entrant: made.parcels[entrant.row].open(make_controller),
+        tell=tell,
+    )
     write_report(path, made.plan, made.tables, images, made.figures, traces, made.facts, args.quick)
     print(f"wrote {path}")
 

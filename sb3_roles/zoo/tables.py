@@ -12,20 +12,22 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.common.durations import long_duration
-from sb3_roles.zoo.config import config_file, read_yaml
+from sb3_roles.evaluation.report import PAGE
+from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
+from sb3_roles.zoo.machine import usable_cores
 from sb3_roles.zoo.options import UsageError, whole_number
+from sb3_roles.zoo.row_runs import LOGS, PLAN, config_of_row
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.crews import Crew
     from sb3_roles.evaluation.grid.plan import Plan
-    from sb3_roles.evaluation.grid.play import Survey
     from sb3_roles.evaluation.grid.store import RecordStore
+    from sb3_roles.evaluation.grid.survey import Survey
     from sb3_roles.zoo.options import Parser, Subparsers
     from sb3_roles.zoo.table_outputs import Made
 
 EXIT_ROWS_FAILED = 3
-RECORDS, PAGE, LOCAL = "records", "report.html", "local"
+RECORDS, LOCAL = "records", "local"
 _ABOUT = (
     "What was played once is kept in records, and only what is missing is played: a command that "
     "was interrupted goes on where it was. Learned rows are the runs of --log-folder with the "
@@ -59,20 +61,18 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def add_options(parser: Parser) -> None:
     """Add the options that the two commands share."""
-    for what, some in (
-        ("tables", "I,II"),
-        ("rows", "random,hmappo"),
-        ("scenes", "easy,hard"),
-        ("figures", "training,time_e"),
+    for what, some, also in (
+        ("tables", "I,II", "; none where figures are named and tables are not"),
+        ("rows", "random,hmappo", ""),
+        ("scenes", "easy,hard", ""),
+        ("figures", "training,time_e", "; none where only tables, rows or scenes are named"),
     ):
         parser.add_argument(
             f"--{what}",
             type=names_of,
             action="extend",
             metavar="NAMES",
-            help=f"only these, such as {some}; figures are left out where others are named only"
-            if what == "figures"
-            else f"only these, such as {some}",
+            help=f"only these, such as {some}{also}",
         )
     parser.add_argument(
         "--episodes",
@@ -99,29 +99,22 @@ def add_options(parser: Parser) -> None:
         "-o", "--out", type=Path, default=Path("results"), metavar="DIR", help="of all that is made"
     )
     parser.add_argument(
-        "-f", "--log-folder", type=Path, default=Path("logs"), metavar="DIR", help="of the runs"
+        "-f", "--log-folder", type=Path, default=LOGS, metavar="DIR", help="of the runs"
     )
     parser.add_argument(
         "--runs",
         action="append",
         default=[],
         metavar="ROW=RUN",
-        help="runs of a learned row, whatever their configuration: a run folder or a pattern; may "
-        "be repeated",
+        help="runs of a learned row, of its algorithm and else whatever their configuration: a run "
+        "folder or a pattern; may be repeated",
     )
     parser.add_argument(
-        "--plan", type=Path, metavar="FILE", help="instead of zoo_configs/tables.yml"
+        "--plan", type=Path, metavar="FILE", help=f"instead of zoo_configs/{PLAN}.yml"
     )
     parser.add_argument(
         "--dry-run", action="store_true", help="only say what is there and what is missing"
     )
-
-
-def n_cpus() -> int:
-    """Return how many CPUs this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def run(args: Namespace) -> int:
@@ -133,8 +126,8 @@ def run(args: Namespace) -> int:
     :raises OSError: if something can not be written
     """
     made = make(args)
-    if made is None:
-        return 0
+    if isinstance(made, int):
+        return made
     if len(made.tables) == 1:
         from sb3_roles.evaluation.tables.writers import to_markdown
 
@@ -149,11 +142,11 @@ def run_report(args: Namespace) -> int:
     :return: as of :func:`run`
     """
     made = make(args)
-    if made is None:
-        return 0
+    if isinstance(made, int):
+        return made
     from sb3_roles.zoo.table_outputs import write_page
 
-    write_page(args, made)
+    write_page(args, made, _tell)
     return made.code
 
 
@@ -166,10 +159,14 @@ def read_plan(args: Namespace) -> Plan:
     from sb3_roles.evaluation.grid.plan import PlanError
     from sb3_roles.evaluation.grid.plan_file import parse_plan
 
-    file = config_file("tables") if args.plan is None else args.plan
+    file = config_file(PLAN) if args.plan is None else args.plan
+    content = read_yaml(file)
     try:
-        plan = parse_plan(read_yaml(file))
-    except PlanError as error:
+        plan = parse_plan(content)
+        for row in plan.rows.values():
+            if row.learned:
+                config_of_row(row)
+    except (PlanError, ConfigError) as error:
         raise UsageError(f"{file}: {error}") from None
     try:
         return plan.select(args.tables, args.rows, args.scenes, args.figures)
@@ -177,31 +174,35 @@ def read_plan(args: Namespace) -> Plan:
         raise UsageError(str(error)) from None
 
 
-def make(args: Namespace) -> Made | None:
+def make(args: Namespace) -> Made | int:
     """Play what is missing, and write tables and figures.
 
     :param args: parsed arguments
-    :return: None for ``--dry-run``, which prints what there is
+    :return: the exit code of ``--dry-run``, which prints what there is
     """
-    started, jobs = time.time(), args.jobs or n_cpus()
+    started, jobs = time.time(), args.jobs or usable_cores()
     plan = read_plan(args)
     if args.figures and find_spec("matplotlib") is None:
         raise UsageError("argument --figures: install sb3_roles[plots] to draw them")
+    there = next(path for path in (args.out, *args.out.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise UsageError(f"argument --out: {there} is no folder")
     if not args.dry_run:
         args.out.mkdir(parents=True, exist_ok=True)
         if not os.access(args.out, os.W_OK):
             raise UsageError(f"argument --out: {str(args.out)!r} can not be written")
     # Read when they are imported: a job is one thread.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from sb3_roles.evaluation.grid.play import Survey, play
-    from sb3_roles.evaluation.grid.store import RecordStore
-    from sb3_roles.zoo.entrants import find_entrants, make_controller, run_files
-    from sb3_roles.zoo.table_outputs import write_all
+    from sb3_roles.evaluation.grid.play import play
+    from sb3_roles.evaluation.grid.store import RecordStore, remove_stale
+    from sb3_roles.evaluation.grid.survey import Survey
+    from sb3_roles.zoo.entrants import find_entrants, make_controller, pack
+    from sb3_roles.zoo.table_outputs import FIGURES, write_all
 
     entrants = find_entrants(plan, args.log_folder, args.runs, _tell)
     store = RecordStore(args.out / RECORDS, _tell, set_aside=not args.dry_run)
     options: dict[str, Any] = {
-        "files": run_files,
+        "pack": pack,
         "quick": args.quick,
         "episodes": args.episodes,
         "report": _tell,
@@ -209,7 +210,10 @@ def make(args: Namespace) -> Made | None:
     if args.dry_run:
         survey = Survey(plan, entrants, store, make_controller, **options)
         print("\n".join(_lines_of(survey, jobs)))
-        return None
+        return EXIT_ROWS_FAILED if survey.failures else 0
+    # What ``write_atomically`` left behind.
+    for folder in (args.out, args.out / FIGURES):
+        remove_stale(folder.glob("*.[0-9]*.partial"))
     try:
         with _crew(args, store) as crew:
             bar = sys.stderr.isatty()
@@ -246,7 +250,7 @@ def _crew(args: Namespace, store: RecordStore) -> Iterator[Crew | None]:
     from sb3_roles.zoo.entrants import make_controller
 
     try:
-        crew = RayCrew(args.ray, make_controller, store, n_cpus())
+        crew = RayCrew(args.ray, make_controller, store, usable_cores())
     except RayError as error:
         raise UsageError(f"argument --ray: {error}") from None
     try:
@@ -256,12 +260,16 @@ def _crew(args: Namespace, store: RecordStore) -> Iterator[Crew | None]:
 
 
 def _lines_of(survey: Survey, jobs: int) -> Iterator[str]:
-    total = 0.0
-    for name, count in survey.counts().items():
-        total += count.seconds
-        left = f", about {long_duration(count.seconds)} on one CPU" if count.missing else ""
-        yield f"{name}: {count.there} blocks are there, {count.missing} are missing{left}"
-    if total:
-        yield f"about {long_duration(total / jobs)} with --jobs {jobs}"
+    from sb3_roles.evaluation.grid.progress import Left
+
+    counts = survey.counts()
+    for name, (there, missing, left) in counts.items():
+        alone = " on one CPU" if left.known else ""
+        rest = f", {left}{alone}" if missing else ""
+        yield f"{name}: {there} blocks are there, {missing} are missing{rest}"
+    total = sum(count.left.seconds for count in counts.values())
+    whole = Left(total / jobs, all(count.left.known for count in counts.values()))
+    if any(count.missing for count in counts.values()):
+        yield f"{whole} with --jobs {jobs}"
     else:
         yield "nothing is missing"

@@ -268,12 +268,14 @@ def _training(figure: Figure, logs: Logs, warn: Warn) -> Iterator[Curve]:
                 warn(f"figure {figure.name}: {row}: a run is left out: {error}")
         for metric in figure.metrics if read else ():
             x, values = common_curves(read, metric)
-            if len(x):
-                low, high = values.min(axis=0), values.max(axis=0)
-                if len(read) == 1:
-                    low = high = np.full(len(x), np.nan)
-                origin = Origin(len(read), None, int(x[-1]))
-                yield Curve(row, None, metric, x, values.mean(axis=0), low, high, origin)
+            if not len(x):
+                warn(f"figure {figure.name}: {row} is left out: its runs share no joint steps")
+                break
+            low, high = values.min(axis=0), values.max(axis=0)
+            if len(read) == 1:
+                low = high = np.full(len(x), np.nan)
+            origin = Origin(len(read), None, int(x[-1]))
+            yield Curve(row, None, metric, x, values.mean(axis=0), low, high, origin)
 
 
 def common_curves(runs: Sequence[TrainingLog], metric: str) -> tuple[np.ndarray, np.ndarray]:
@@ -281,7 +283,8 @@ def common_curves(runs: Sequence[TrainingLog], metric: str) -> tuple[np.ndarray,
 
     :param runs: at least one
     :param metric: of ``TrainingLog.rewards``
-    :return: joint steps, int64 (T,), all at which one of the runs has a value; and float64
+    :return: joint steps, int64 (T,), all at which one of the runs has a value, none if one ended
+        before another began; and float64
         (n_runs, T), between two values of a run on a straight line
     """
     steps = np.unique(np.concatenate([run.steps for run in runs]))

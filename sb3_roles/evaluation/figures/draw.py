@@ -21,18 +21,12 @@ from sb3_roles.evaluation.figures.files import SUFFIXES, drawing_style, render
 from sb3_roles.evaluation.figures.panels import draw
 from sb3_roles.evaluation.grid.entrants import Results
 from sb3_roles.evaluation.grid.plan import Figure, Plan
+from sb3_roles.evaluation.metrics import MEANINGS
 
 _MEANINGS = {
     "explore_reward": "explore reward: newly seen cells of the team over B_e",
     "cover_reward": "cover reward: newly covered targets of the team",
-    "explo_paper": "exploration as in the paper: newly seen cells, obstacles included, over free "
-    "cells, which can exceed 100 %",
-    "explo_true": "explored share of the free cells",
-    "cover": "share of the targets covered",
-    "time_e_paper": "Time_E: first step, counted from 0, at which the mean of newly seen over free "
-    "cells exceeds 90 %",
-    "t90_true": "mean first step, counted from 0, with 90 % of the free cells explored, over the "
-    "episodes that get there; above each bar their share in %",
+    **{name: f"{meaning.text} ({name})" for name, meaning in MEANINGS.items()},
 }
 
 
@@ -93,9 +87,9 @@ def caption(figure: Figure, quick: bool, plan: Plan, results: Results, logs: Log
         seeds, what the bands are, and which rows are missing
     """
     drawn = collect(figure, results, logs, lambda line: None)
-    sentences = [figure.caption, "; ".join(_MEANINGS[metric] for metric in _meant(figure))]
+    sentences = [figure.caption, *(_MEANINGS[metric] for metric in _meant(figure))]
     if drawn:
-        sentences += [*_drawn_how(figure, drawn), *_sources(plan, figure, drawn)]
+        sentences += [*_drawn_how(figure, drawn), *_sources(plan, drawn)]
     there = {one.row for one in drawn}
     missing = [plan.rows[row].label for row in figure.rows if row not in there]
     if missing:
@@ -148,7 +142,7 @@ def _drawn_how(figure: Figure, drawn: Drawn) -> list[str]:
     return how
 
 
-def _sources(plan: Plan, figure: Figure, drawn: Drawn) -> list[str]:
+def _sources(plan: Plan, drawn: Drawn) -> list[str]:
     """Say how many episodes, seeds and joint steps of training there are."""
     sources = []
     by_row: dict[str, list[Curve | Bar]] = {}

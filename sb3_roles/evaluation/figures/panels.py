@@ -37,7 +37,7 @@ _SCENE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9
 
 
 def draw(plan: Plan, figure: Figure, drawn: Drawn, note: str) -> Canvas:
-    """Draw a figure; within ``figure_files.drawing_style``.
+    """Draw a figure; within ``figures.files.drawing_style``.
 
     :param plan: of the figure
     :param figure: of the plan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -38,22 +39,25 @@ def read_training_log(folder: Path) -> TrainingLog:
     R_e is the number of newly seen cells over B_e, R_c that of newly covered targets, whatever the
     weights with which the run was paid for them.
 
-    :param folder: of the run, with ``progress.csv`` and ``config.yml``
+    :param folder: of the run, with ``progress.csv`` and ``config.yml``; a last line without its end
+        is left out
     :raises TrainingLogError: naming the file, if one is missing or damaged, or the scene no scene
     """
     scene = _scene(folder / "config.yml")
     path = folder / "progress.csv"
     by_step: dict[int, tuple[float, float]] = {}
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file, strict=True):
-                # Before the first episode has ended there is nothing to tell; a row that was cut
-                # short lacks its last entries, which DictReader gives as None.
-                values = [row[_EXPLORED], row[_COVERED]]
-                if None in row.values() or None in row:
-                    raise ValueError("a row has not as many entries as the first line")
-                if all(values):
-                    by_step[int(row[_STEPS])] = (float(values[0]), float(values[1]))
+        content = path.read_bytes()
+        # A training that goes on may have written a part of its last line.
+        whole = content[: content.rfind(b"\n") + 1].decode()
+        for row in csv.DictReader(io.StringIO(whole, newline=""), strict=True):
+            # Before the first episode has ended there is nothing to tell; a row that was cut
+            # short lacks its last entries, which DictReader gives as None.
+            values = [row[_EXPLORED], row[_COVERED]]
+            if None in row.values() or None in row:
+                raise ValueError("a row has not as many entries as the first line")
+            if all(values):
+                by_step[int(row[_STEPS])] = (float(values[0]), float(values[1]))
     except OSError as error:
         raise TrainingLogError(f"{path}: {error.strerror}") from None
     except KeyError as error:

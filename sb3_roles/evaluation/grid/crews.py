@@ -17,7 +17,7 @@ from area_search.scenes import get_scene
 from sb3_roles.common.names import one_line
 from sb3_roles.evaluation.episodes import describe, run_episodes
 from sb3_roles.evaluation.grid.entrants import Entrant
-from sb3_roles.evaluation.grid.store import RecordStore, Series, Span
+from sb3_roles.evaluation.grid.store import RecordStore, Series, Span, is_full, named
 from sb3_roles.evaluation.records import EpisodeRecords
 
 if TYPE_CHECKING:
@@ -54,14 +54,16 @@ class Parcel:
         """Make the controller.
 
         :param make: is given the entrant, with a folder of the files as its source
+        :raises OSError: if the disk refuses the files
         """
         if not self.files:
             return make(self.entrant)
         with tempfile.TemporaryDirectory(prefix="sb3_roles-") as folder:
             for name, content in self.files.items():
                 path = Path(folder, name)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(content)
+                with named(path):
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.write_bytes(content)
             return make(replace(self.entrant, source=folder))
 
 
@@ -105,7 +107,7 @@ class Finished(NamedTuple):
     :param task: the task
     :param records: None if the controller failed
     :param error: one line about that
-    :param stop: the store could not be written: there is no point in going on
+    :param stop: the store could not be written, or a disk is full: there is no point in going on
     """
 
     task: Task
@@ -140,7 +142,8 @@ def play_block(task: Task, controllers: Controllers) -> Finished:
 
     :param task: what to play
     :param controllers: of this process
-    :return: with an error if the controller can not be made or fails, whatever it raises
+    :return: with an error if the controller can not be made or fails, whatever it raises; with
+        ``stop`` if a disk is full
     """
     # Sums of networks depend on the number of threads.
     th.set_num_threads(1)
@@ -154,6 +157,8 @@ def play_block(task: Task, controllers: Controllers) -> Finished:
         n, seed = last - first, task.series.seed
         records = run_episodes(controller, scene, n, seed, first, batch_size=n, name=name)
     except Exception as error:
+        if isinstance(error, OSError) and is_full(error):
+            return Finished(task, stop=error)
         return Finished(task, error=error_line(error, task.parcel.entrant))
     return Finished(task, records)
 

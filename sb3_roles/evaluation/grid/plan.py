@@ -172,11 +172,12 @@ class Plan:
     ) -> Plan:
         """Return a part of the plan.
 
-        :param tables: names of those to keep; None for all, and the same below. Where tables, rows
-            or scenes are named, no figure is kept that is not named, too
+        :param tables: names of those to keep; None for all, and the same below. Where figures are
+            named, no table is kept that is not named, too
         :param rows: of tables and figures
         :param scenes: of tables and figures; what has none of them is left out
-        :param figures: names
+        :param figures: names; where tables, rows or scenes are named, no figure is kept that is not
+            named, too
         :raises PlanError: for a name that is not there, or if nothing is left
         """
         scene_names = dict.fromkeys(column.scene for _, column in self.cells())
@@ -189,6 +190,8 @@ class Plan:
             for name in chosen or ():
                 if name not in known:
                     raise PlanError(closest(what, name, known))
+        if figures is not None and tables is None:
+            tables = ()
         if figures is None and any(part is not None for part in (tables, rows, scenes)):
             figures = ()
         kept_tables = _restrict(self.tables, tables, rows, scenes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from area_search.scenes import SCENES
+from area_search.scenes import SCENES, shown
 from sb3_roles.baselines import CONTROLLER_NAMES
 from sb3_roles.common.names import closest
 from sb3_roles.evaluation.grid.plan import (
@@ -18,6 +18,11 @@ from sb3_roles.evaluation.grid.plan import (
     Row,
     Table,
 )
+
+# Of the stream of episodes; see ``held_out_seed``.
+_MAX_SEED = 2**63 - 1
+# Percentages and steps are far below.
+_MAX_PRINTED = 1e6
 
 # What a check returns is what the value should have been; None: it is that.
 Check = Callable[[object], str | None]
@@ -41,10 +46,12 @@ def parse_plan(content: object) -> Plan:
     return Plan(top["episodes"], top["quick_episodes"], top["seed"], rows, tables, figures)
 
 
-def _whole(low: int) -> Check:
-    def check(value: object) -> str | None:
-        sound = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        return None if sound else f"a whole number of at least {low}"
+def _whole(low: int, high: int | None = None) -> Check:
+    def check(value: Any) -> str | None:
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        if whole and low <= value <= (value if high is None else high):
+            return None
+        return f"a whole number of at least {low}" + ("" if high is None else f", at most {high}")
 
     return check
 
@@ -54,26 +61,39 @@ def _is(kind: type, what: str) -> Check:
 
 
 def _list_of(kind: type, what: str) -> Check:
-    def check(value: object) -> str | None:
+    def check(value: Any) -> str | None:
         sound = isinstance(value, list) and value and all(isinstance(one, kind) for one in value)
-        return None if sound else f"a list of {what}"
+        # What is there twice would be printed, and counted, twice.
+        once = sound and len(set(value)) == len(value)
+        return None if once else f"a list of {what}, each once"
 
     return check
 
 
 _NAMES = _list_of(str, "names")
+
+
+def _line(value: object, may_be_empty: bool = False) -> str | None:
+    sound = isinstance(value, str) and value.isprintable() and (may_be_empty or value.strip())
+    return None if sound else "a text of one line" + ("" if may_be_empty else ", not empty")
+
+
+def _about(value: object) -> str | None:
+    return _line(value, may_be_empty=True)
+
+
 _TEXT, _FLAG = _is(str, "a text"), _is(bool, "true or false")
 _MAPPING = _is(dict, "keys and values")
 _TOP: dict[str, Check] = {
     "episodes": _whole(1),
     "quick_episodes": _whole(1),
-    "seed": _whole(0),
+    "seed": _whole(0, _MAX_SEED),
     "rows": _MAPPING,
     "tables": _MAPPING,
     "figures": _MAPPING,
 }
 _ROW: dict[str, Check] = {
-    "label": _TEXT,
+    "label": _line,
     "controller": _TEXT,
     "algo": _TEXT,
     "conf": _TEXT,
@@ -83,10 +103,10 @@ _ROW: dict[str, Check] = {
     "episodes": _whole(1),
     "quick_episodes": _whole(1),
     "block": _whole(1),
-    "about": _TEXT,
+    "about": _about,
 }
 _PART: dict[str, Check] = {
-    "caption": _TEXT,
+    "caption": _line,
     "n_agents": _list_of(int, "numbers of robots"),
     "scenes": _MAPPING,
     "metrics": _NAMES,
@@ -143,10 +163,12 @@ def _check_names(where: str, what: str, names: Iterable[object], known: Iterable
 
 def _columns(where: str, given: Mapping[str, Any]) -> tuple[Column, ...]:
     scenes = given["scenes"]
+    if not scenes:
+        raise PlanError(f"{where}: scenes must be at least one scene")
     _check_names(where, "scene", scenes, SCENES)
-    for label in scenes.values():
-        if not isinstance(label, str):
-            raise PlanError(f"{where}: a scene is called by a text, got {label!r}")
+    for scene, label in scenes.items():
+        if _line(label) is not None:
+            raise PlanError(f"{where}: the label of {scene} must be {_line(label)}, got {label!r}")
     for n_agents in given["n_agents"]:
         wanted = _whole(1)(n_agents)
         if wanted is not None:
@@ -187,8 +209,11 @@ def _printed(
                     raise PlanError(f"{place}: {metric} must have one value for each scene")
                 for scene, value in zip(table["scenes"], printed, strict=True):
                     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-                    if not (value is None or number):
-                        raise PlanError(f"{place}: {metric} must be numbers or null, got {value!r}")
+                    if not (value is None or (number and 0 <= value <= _MAX_PRINTED)):
+                        raise PlanError(
+                            f"{place}: {metric} must be null or numbers from 0 to "
+                            f"{_MAX_PRINTED:.0f}, got {shown(value)}"
+                        )
                     values[row, Column(scene, n_agents), metric] = value
     return values
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from typing import Any
+from typing import Any, NamedTuple
 
 from sb3_roles.common.durations import long_duration
 from sb3_roles.evaluation.grid.plan import Cell, Row
@@ -15,6 +15,26 @@ from sb3_roles.evaluation.grid.store import Report
 _PRIOR = 1.0
 # Between rows that plan for all robots at once and rows where each robot decides for itself.
 _EXPONENT = 0.5
+
+
+class Left(NamedTuple):
+    """An estimate of what is left to play.
+
+    :param seconds: of rows that were measured
+    :param known: whether there are no others
+    """
+
+    seconds: float
+    known: bool
+
+    def __str__(self) -> str:
+        if self.known:
+            return f"about {long_duration(self.seconds)}"
+        return f"more than {long_duration(self.seconds)}" if self.seconds else "time not known yet"
+
+    def text(self) -> str:
+        """Say how much is left, for the end of a line."""
+        return f"{self} left" if self.known or self.seconds else str(self)
 
 
 class Estimates:
@@ -35,6 +55,13 @@ class Estimates:
         for key in ((row.name, n_agents), (row.name, 0)):
             self._sums[key][0] += seconds
             self._sums[key][1] += n_agents**_EXPONENT * n_episodes
+
+    def knows(self, row: Row) -> bool:
+        """Whether episodes of a row were measured; otherwise its seconds only serve for an order.
+
+        :param row: that plays
+        """
+        return (row.name, 0) in self._sums
 
     def seconds(self, row: Row, n_agents: int, n_episodes: int) -> float:
         """Estimate what episodes take, in seconds.
@@ -70,22 +97,22 @@ class Progress:
             form = "{percentage:3.0f}%|{bar}| {n_fmt} of {total_fmt} blocks, {elapsed}{postfix}"
             self._bar = tqdm(total=n_blocks, bar_format=form, file=sys.stderr, leave=False)
 
-    def block_done(self, seconds_left: float) -> None:
+    def block_done(self, left: Left) -> None:
         """One more block was played, or is no longer wanted."""
         if self._bar is not None:
-            self._bar.set_postfix_str(f"about {long_duration(seconds_left)} left", refresh=False)
+            self._bar.set_postfix_str(left.text(), refresh=False)
             self._bar.update()
             self._bar.refresh()
 
-    def cell_done(self, cell: Cell, n_episodes: int, seconds_left: float) -> None:
+    def cell_done(self, cell: Cell, n_episodes: int, left: Left) -> None:
         """All blocks of a cell are there."""
         self._finished += 1
         if self._bar is None:
             row, column = cell
-            left = f", about {long_duration(seconds_left)} left" if seconds_left > 0 else ""
+            rest = "" if left == (0.0, True) else f", {left.text()}"
             self._report(
                 f"{row}, {column.scene}, {column.n_agents} robots: {n_episodes} episodes; "
-                f"{self._finished} of {self._n_cells} cells{left}"
+                f"{self._finished} of {self._n_cells} cells{rest}"
             )
 
     def close(self) -> None:

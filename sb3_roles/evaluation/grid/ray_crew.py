@@ -91,10 +91,10 @@ class RayCrew:
         (done,), _ = ray.wait(list(self._running), num_returns=1)
         task = self._running.pop(done)
         try:
-            records, error = ray.get(done)
+            answer = ray.get(done)
         except _RayError as failure:
             return Finished(task, error=f"Ray: {one_line(failure)[:200]}")
-        return keep(Finished(task, records, error), self._store)
+        return keep(Finished(task, *answer), self._store)
 
     def close(self) -> None:
         """Leave the cluster, which ends what it still plays, and stop it if it was started here."""
@@ -119,8 +119,10 @@ def _controllers(make: Make) -> Controllers:
     return Controllers(make)
 
 
-def _play(task: Task, files: Mapping[str, bytes], make: Make) -> tuple[EpisodeRecords | None, str]:
+def _play(
+    task: Task, files: Mapping[str, bytes], make: Make
+) -> tuple[EpisodeRecords | None, str, OSError | None]:
     """Play a block in a worker of Ray, which is used for one task after the other."""
     task = task._replace(parcel=replace(task.parcel, files=files))
     finished = play_block(task, _controllers(make))
-    return finished.records, finished.error
+    return finished.records, finished.error, finished.stop

@@ -7,11 +7,12 @@ depend on where a run was interrupted, nor on what was asked for before.
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from sb3_roles.evaluation.grid.plan import Column
 from sb3_roles.evaluation.records import (
     EpisodeRecords,
     RecordsError,
+    UnreadableError,
     read_records,
     write_records,
 )
@@ -31,9 +33,41 @@ SUFFIX, DAMAGED, _TEMPORARY = ".parquet", ".damaged", ".tmp"
 # Files are written in milliseconds; a temporary one of that age has lost its writer.
 _STALE_SECONDS = 600.0
 _DIGITS = 16
+# Of the machine and not of a file: the next one would fare no better.
+_STOP = (errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM)
+_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 Report = Callable[[str], None]
 """Takes one line for the user."""
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether an error says that a disk, or the user's part of it, is full."""
+    return isinstance(error, OSError) and error.errno in _FULL
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Tell an error of the disk which path it is about, where it does not say."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+def remove_stale(paths: Iterable[Path]) -> None:
+    """Remove temporary files of writers that were killed, if they are some minutes old.
+
+    :param paths: of temporary files
+    """
+    latest = time.time() - _STALE_SECONDS
+    for path in paths:
+        # Another process may clean as well, or the folder be read-only.
+        with suppress(OSError):
+            if path.stat().st_mtime < latest:
+                path.unlink()
 
 
 class Span(NamedTuple):
@@ -100,7 +134,10 @@ class RecordStore:
 
         :param series: whose it is
         :param span: its episodes
-        :return: None if it is not there, or its file is damaged or of something else
+        :return: None if it is not there, or its file can not be read, is damaged or of something
+            else
+        :raises OSError: if nothing can be read now: there are too many open files, the disk fails,
+            or the memory is full
         """
         path = self.path(series, span)
         if not path.is_file():
@@ -108,6 +145,13 @@ class RecordStore:
         try:
             records = read_records(path)
             _check(path, records, series, span)
+        except UnreadableError as error:
+            # It may be sound: it stays until it is replaced.
+            number = getattr(error.error, "errno", None)
+            if number in _STOP:
+                raise OSError(number, os.strerror(number), str(path)) from error
+            self._report(f"{one_line(error)}; it is played again")
+            return None
         except RecordsError as error:
             self._report(f"{one_line(error)}; {self._put_aside(path)}it is played again")
             return None
@@ -124,19 +168,15 @@ class RecordStore:
         path = self.path(series, span)
         temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_TEMPORARY}")
         try:
-            write_records(records, temporary)
-            os.replace(temporary, path)
+            with named(path):
+                write_records(records, temporary)
+                os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
 
     def clean(self) -> None:
-        """Remove temporary files of writers that were killed, if they are some minutes old."""
-        latest = time.time() - _STALE_SECONDS
-        for path in self.folder.rglob(f".*{_TEMPORARY}*"):
-            # Another process may clean as well, or the folder be read-only.
-            with suppress(OSError):
-                if path.stat().st_mtime < latest:
-                    path.unlink()
+        """Remove temporary files of writers that were killed, see :func:`remove_stale`."""
+        remove_stale(self.folder.rglob(f".*{_TEMPORARY}*"))
 
     def unused(self, rows: Collection[str], used: Collection[Series]) -> list[Path]:
         """Find records of the same rows that are not those of any series in use.

@@ -49,23 +49,12 @@ function drawStrip() {
 
 const shorten = (text, length) => (text.length > length ? `${text.slice(0, length - 1)}\u2026` : text);
 
-const MEANINGS = [
-  ["explo_paper", "What the paper prints as exploration: cells newly seen from step 1 on, obstacles "
-    + "included and the view at the start excluded, over the number of free cells. It can exceed 100 %; "
-    + "a printed 100.0 stands for 100 or more."],
-  ["explo_true", "Share of the free cells that the team has seen, the start included. Never above 100 %."],
-  ["cover", "Targets that a robot stepped on from step 1 on, over all targets."],
-  ["time_e_paper", "The first step, counted from 0, at which the mean curve of explo_paper exceeds "
-    + "90 %; a dash where it never does."],
-  ["t90_true", "The first step with explo_true of at least 90 %, mean over the episodes that get "
-    + "there; beside it the share that does."],
-];
-
 function drawHonesty() {
   const body = byId("honesty-body");
   body.append(make("h3", {}, "What the metrics mean"),
-    make("dl", { class: "meanings" }, MEANINGS.flatMap(([name, text]) => [make("dt", {},
-        make("code", {}, name)), make("dd", {}, whole(text))])));
+    make("dl", { class: "meanings" }, Object.entries(DATA.metrics).flatMap(
+        ([name, { text }]) => [make("dt", {}, make("code", {}, name)),
+          make("dd", {}, whole(`${text[0].toUpperCase()}${text.slice(1)}.`))])));
   body.append(make("h3", {}, "Setting and method"),
     make("p", { class: "hint" },
         "What our side rests on: the paper\u2019s text, the authors\u2019 released code, a measurement by "
@@ -98,7 +87,7 @@ function listDeviations(list, chosen) {
 /** All printed numbers with ours, the largest difference first. */
 function drawPrinted(body) {
   const cells = DATA.printed;
-  const played = cells.filter((cell) => cell.ours !== null);
+  const played = cells.filter((cell) => cell.played);
   const missed = played.filter((cell) => !cell.reached);
   body.append(make("h3", {}, "What was not reproduced, and by how much"));
   if (!cells.length) {
@@ -107,8 +96,8 @@ function drawPrinted(body) {
   }
   body.append(make("p", { class: "hint" },
     `${cells.length} numbers are printed; ${played.length} of them were played, and ours falls short of `
-    + `${missed.length}. The largest difference comes first, in either direction; a printed 100 is `
-    + "reached from 100 on."));
+    + `${missed.length}. The largest difference comes first, in either direction, and before it `
+    + "what is never reached, a dash; a printed 100 is reached from 100 on."));
   const names = [...new Set(cells.map((cell) => cell.row))];
   const chosen = make("select", { id: "printed-row" }, make("option", { value: "" }, "all methods"),
       names.map((name) => make("option", { value: name }, DATA.rows[name].label)));
@@ -116,14 +105,15 @@ function drawPrinted(body) {
   const rows = make("tbody", {});
   const fill = () => rows.replaceChildren(...cells
     .filter((cell) => (!chosen.value || cell.row === chosen.value)
-        && (!only.checked || (cell.ours !== null && !cell.reached)))
+        && (!only.checked || (cell.played && !cell.reached)))
     .map((cell) => make("tr", {},
       make("td", {}, cell.label), make("td", {}, `${cell.scene}, ${cell.n_agents}`),
           make("td", {}, metricName(cell.metric)), make("td", { class: "number" },
           fixed(cell.paper, cell.metric === "time_e_paper" ? 0 : 1)),
-      make("td", { class: "number" }, cell.ours === null ? "\u00b7" : fixed(cell.ours)),
+      make("td", { class: "number" }, !cell.played ? "\u00b7" : cell.ours === null ? "\u2013"
+          : fixed(cell.ours)),
       make("td", { class: `number ${cell.reached ? "reached" : "behind"}` },
-          cell.ours === null ? "\u00b7" : cell.difference === null ? "\u2713" : signed(cell.difference)),
+          !cell.played ? "\u00b7" : cell.ours === null ? "\u2013" : cell.difference === null ? "\u2713" : signed(cell.difference)),
       make("td", {}, cell.table))));
   chosen.addEventListener("change", fill);
   only.addEventListener("change", fill);

@@ -24,19 +24,12 @@ const digitsOf = (value, unit) => (unit === "steps" && Number.isInteger(value) ?
 const robots = (n) => (n === 1 ? "1 robot" : `${n} robots`);
 
 function duration(seconds) {
-  if (seconds < 1e-3) return `${Number((seconds * 1e6).toPrecision(2))} \u00b5s`;
-  if (seconds < 1) return `${Number((seconds * 1e3).toPrecision(2))} ms`;
-  return `${Number(seconds.toPrecision(2))} s`;
+  if (seconds < 1e-3) return `${Number((seconds * 1e6).toPrecision(3))} \u00b5s`;
+  if (seconds < 1) return `${Number((seconds * 1e3).toPrecision(3))} ms`;
+  return `${Number(seconds.toPrecision(3))} s`;
 }
 
-const METRICS = {
-  explo_paper: "Explored (paper)",
-  explo_true: "Explored (true)",
-  cover: "Covered",
-  time_e_paper: "Time_E (paper)",
-  t90_true: "t90 (true)",
-};
-const metricName = (metric) => METRICS[metric] || metric;
+const metricName = (metric) => (DATA.metrics[metric] ? DATA.metrics[metric].short : metric);
 
 /** A row of radio buttons. */
 function radios(parent, name, choices, chosen, onChoice) {

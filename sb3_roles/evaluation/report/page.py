@@ -17,9 +17,10 @@ import yaml
 
 from sb3_roles.common.files import write_atomically
 from sb3_roles.evaluation.grid.plan import Column, Figure, Plan, Table
-from sb3_roles.evaluation.report.summary import is_reached, printed_cells, summarize_tables
+from sb3_roles.evaluation.metrics import MEANINGS
+from sb3_roles.evaluation.report.printed import is_reached, printed_cells
+from sb3_roles.evaluation.report.summary import summarize_tables
 from sb3_roles.evaluation.report.traces import Trace, encode_traces
-from sb3_roles.evaluation.tables.model import METRIC_LABELS
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.tables.model import TableResult, TableRow, Value
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 TITLE = "Multi-robot area search: tables, figures and episodes"
 SCRIPTS = ("page.js", "tables.js", "honesty.js", "map.js", "pane.js", "player.js")
 """In the order in which they are put together."""
-SOURCES = ("paper", "released code", "measured", "inferred", "ours")
-"""What our side of a deviation rests on."""
 _FIELDS = ("area", "what", "paper", "ours", "source", "switch")
 
 
@@ -85,7 +84,7 @@ def report_content(
             for name, row in plan.rows.items()
         },
         "scenes": scenes,
-        "metrics": METRIC_LABELS,
+        "metrics": {name: meaning._asdict() for name, meaning in MEANINGS.items()},
         "tables": [_table(name, table) for name, table in tables.items()],
         "figures": [
             {"caption": captions.get(name) or _caption(plan, name), "source": _image(svg)}
@@ -147,6 +146,10 @@ def _row(row: TableRow, table: TableResult) -> dict[str, Any]:
         ],
         "overall": [
             [_number_of(row.overall.get((n, metric))) for metric in spec.metrics] for n in teams
+        ],
+        "batch": row.batch,
+        "decision": [
+            _number(row.decision_over(Column(scene, n) for scene in spec.scenes)) for n in teams
         ],
         "seconds": [
             [_number(row.decision.get(Column(scene, n))) for scene in spec.scenes] for n in teams

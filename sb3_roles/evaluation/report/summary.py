@@ -8,9 +8,11 @@ from statistics import mean
 from typing import TYPE_CHECKING, NamedTuple
 
 from sb3_roles.evaluation.grid.plan import SCORES, Column, Plan
+from sb3_roles.evaluation.report.printed import Gap, printed_cells
+from sb3_roles.evaluation.tables.aggregate import MIN_EPISODES
 
 if TYPE_CHECKING:
-    from sb3_roles.evaluation.tables.model import TableResult, TableRow, Value
+    from sb3_roles.evaluation.tables.model import TableResult, TableRow
 
 # Rows of zoo_configs/tables.yml that the sentences are about; those that a plan lacks are skipped.
 OURS, WITHOUT_ROLES, ASSIGNED, GREEDY, BOUND = (
@@ -36,81 +38,6 @@ class Point(NamedTuple):
     text: str
 
 
-class Gap(NamedTuple):
-    """One printed number beside ours.
-
-    :param table: its name
-    :param row: name of the row
-    :param label: what readers call the row
-    :param scene: what readers call the scene
-    :param n_agents: robots
-    :param metric: its name
-    :param paper: as printed
-    :param ours: None if it does not exist or was not played
-    :param difference: ours minus the paper's; None without ours, and where both are 100 % or more
-    :param reached: ours is at least as good, or its 95 % interval ends there
-    """
-
-    table: str
-    row: str
-    label: str
-    scene: str
-    n_agents: int
-    metric: str
-    paper: float
-    ours: float | None
-    difference: float | None
-    reached: bool
-
-
-def is_reached(value: Value) -> bool:
-    """Whether ours is at least as good as printed, or its 95 % interval ends there.
-
-    :param value: of a cell
-    """
-    if value.mean is None or value.paper is None:
-        return False
-    if value.unit == "steps":
-        return min(value.mean, value.mean if value.low is None else value.low) <= value.paper
-    return max(value.mean, value.mean if value.high is None else value.high) >= value.paper
-
-
-def printed_cells(tables: Mapping[str, TableResult]) -> list[Gap]:
-    """Return every printed number with ours, the largest difference first, those not played last.
-
-    A number that two tables print is listed once, as the first prints it.
-
-    :param tables: by name
-    """
-    found: dict[tuple[str, Column, str], Gap] = {}
-    for name, table in tables.items():
-        for row in table.rows:
-            for (row_name, column, metric), paper in table.spec.paper.items():
-                key = row_name, column, metric
-                if row_name != row.name or paper is None or key in found:
-                    continue
-                value = row.values.get((column, metric))
-                found[key] = Gap(
-                    name,
-                    row.name,
-                    row.label,
-                    table.spec.scenes[column.scene],
-                    column.n_agents,
-                    metric,
-                    paper,
-                    value.mean if value else None,
-                    value.difference if value else None,
-                    value is not None and is_reached(value),
-                )
-    return sorted(found.values(), key=_size, reverse=True)
-
-
-def _size(cell: Gap) -> float:
-    if cell.ours is None:
-        return -1.0
-    return abs(cell.difference or 0.0)
-
-
 def summarize_tables(plan: Plan, tables: Mapping[str, TableResult]) -> list[Point]:
     """Say in a few sentences what the tables show; what was not played is not talked about.
 
@@ -125,7 +52,7 @@ def summarize_tables(plan: Plan, tables: Mapping[str, TableResult]) -> list[Poin
         *_greedy(plan, means, gaps),
         *_furthest_below(gaps),
         *_best_learned(rows, means),
-        *_roles(means),
+        *_roles(rows, means),
         *_true_share(rows, scenes, means),
         *_bound(rows, scenes, means),
     ]
@@ -142,18 +69,35 @@ def _signed(points: float) -> str:
     return f"{points:+.1f}".replace("-", "\N{MINUS SIGN}")
 
 
+class _Mean(NamedTuple):
+    """A mean, over how many episodes of how many training runs."""
+
+    value: float
+    n_episodes: int
+    n_seeds: int
+
+
 # Metric -> column -> row -> mean, of what exists.
-_Means = Mapping[str, Mapping[Column, Mapping[str, float]]]
+_Means = Mapping[str, Mapping[Column, Mapping[str, _Mean]]]
 
 
 def _means(tables: Mapping[str, TableResult]) -> _Means:
-    means: dict[str, dict[Column, dict[str, float]]] = {metric: {} for metric in SCORES}
+    means: dict[str, dict[Column, dict[str, _Mean]]] = {metric: {} for metric in SCORES}
     for table in tables.values():
         for row in table.rows:
             for (column, metric), value in row.values.items():
                 if value.mean is not None:
-                    means[metric].setdefault(column, {}).setdefault(row.name, value.mean)
+                    one = _Mean(value.mean, value.n_episodes, value.n_seeds)
+                    means[metric].setdefault(column, {}).setdefault(row.name, one)
     return means
+
+
+def _gain(of_rows: Mapping[str, _Mean], row: str, other: str) -> float | None:
+    """Return what a row has more than another; None unless both played the same episodes."""
+    ours, theirs = of_rows.get(row), of_rows.get(other)
+    if ours is None or theirs is None or ours.n_episodes != theirs.n_episodes:
+        return None
+    return ours.value - theirs.value
 
 
 def _example(columns: Iterable[Column]) -> Column | None:
@@ -167,7 +111,7 @@ def _mark(good: int, total: int) -> str:
 
 
 def _own_row(rows: Mapping[str, TableRow], gaps: Sequence[Gap]) -> Iterator[Point]:
-    own = [one for one in gaps if one.row == OURS and one.ours is not None]
+    own = [one for one in gaps if one.row == OURS and one.played]
     if not own:
         return
     parts = []
@@ -186,12 +130,12 @@ def _own_row(rows: Mapping[str, TableRow], gaps: Sequence[Gap]) -> Iterator[Poin
         _mark(good, len(own)),
         f"{row.label} reaches {good} of {len(own)} numbers printed for the paper's method",
         f"By metric: {', '.join(parts)}{budget}. A number is reached if ours is at least as good, "
-        "or our 95 % interval ends there.",
+        f"or our 95 % interval, of at least {MIN_EPISODES} episodes, ends there.",
     )
 
 
 def _greedy(plan: Plan, means: _Means, gaps: Sequence[Gap]) -> Iterator[Point]:
-    greedy = [one for one in gaps if one.row == GREEDY and one.ours is not None]
+    greedy = [one for one in gaps if one.row == GREEDY and one.played]
     cover = [one for one in greedy if one.metric == "cover"]
     if not cover:
         return
@@ -203,7 +147,7 @@ def _greedy(plan: Plan, means: _Means, gaps: Sequence[Gap]) -> Iterator[Point]:
         f"robots: {most.ours:.1f} % covered, {most.paper:.1f} % printed."
     )
     rivals = [
-        (of_rows[GREEDY], paper)
+        (of_rows[GREEDY].value, paper)
         for column, of_rows in means["cover"].items()
         if GREEDY in of_rows
         for paper in [_printed(plan, OURS, column, "cover")]
@@ -230,7 +174,7 @@ def _furthest_below(gaps: Sequence[Gap]) -> Iterator[Point]:
     worst = min(short, key=lambda one: one.difference or 0.0)
     rows = Counter(one.label for one in short)
     where = ", ".join(f"{label} {count}" for label, count in rows.most_common())
-    played = sum(one.ours is not None and one.metric != "time_e_paper" for one in gaps)
+    played = sum(one.played and one.metric != "time_e_paper" for one in gaps)
     yield Point(
         "differs",
         f"{len(short)} of {played} printed percentages are not reached",
@@ -247,10 +191,11 @@ def _printed(plan: Plan, row: str, column: Column, metric: str) -> float | None:
 def _best_learned(rows: Mapping[str, TableRow], means: _Means) -> Iterator[Point]:
     differences, names = [], []
     for of_rows in means["cover"].values():
-        learned = [name for name in of_rows if rows[name].learned]
-        if ASSIGNED in of_rows and learned:
-            best = max(learned, key=lambda name: of_rows[name])
-            differences.append(of_rows[best] - of_rows[ASSIGNED])
+        learned = {name: _gain(of_rows, name, ASSIGNED) for name in of_rows if rows[name].learned}
+        gains = {name: gain for name, gain in learned.items() if gain is not None}
+        if gains:
+            best = max(gains, key=lambda name: gains[name])
+            differences.append(gains[best])
             names.append(rows[best].label)
     if not differences:
         return
@@ -264,19 +209,26 @@ def _best_learned(rows: Mapping[str, TableRow], means: _Means) -> Iterator[Point
     )
 
 
-def _roles(means: _Means) -> Iterator[Point]:
-    pairs = [
-        of_rows[OURS] - of_rows[WITHOUT_ROLES]
-        for of_rows in means["cover"].values()
-        if {OURS, WITHOUT_ROLES} <= of_rows.keys()
-    ]
-    if pairs:
-        yield Point(
-            "note",
-            f"Roles change coverage by {_signed(mean(pairs))} points",
-            f"HMAPPO against MAPPO with the same observations, over {len(pairs)} places, from "
-            f"{_signed(min(pairs))} to {_signed(max(pairs))}.",
-        )
+def _roles(rows: Mapping[str, TableRow], means: _Means) -> Iterator[Point]:
+    gains, seeds = [], []
+    for of_rows in means["cover"].values():
+        gain = _gain(of_rows, OURS, WITHOUT_ROLES)
+        if gain is not None:
+            gains.append(gain)
+            seeds.append((of_rows[OURS].n_seeds, of_rows[WITHOUT_ROLES].n_seeds))
+    if not gains:
+        return
+    average = mean(gains)
+    more = "more" if average >= 0 else "less"
+    ours, theirs = min(one for one, _ in seeds), min(other for _, other in seeds)
+    yield Point(
+        "note",
+        f"{rows[OURS].label} covers {abs(average):.1f} points {more} than "
+        f"{rows[WITHOUT_ROLES].label}",
+        f"Over {len(gains)} places, from {_signed(min(gains))} to {_signed(max(gains))}, with "
+        f"{ours} against {theirs} training seeds. Both have the same observations, but the reward "
+        "for moves differs, too: roles alone need not be the reason.",
+    )
 
 
 def _true_share(
@@ -290,30 +242,33 @@ def _true_share(
         "note",
         "The printed exploration is not the share of the map that was seen",
         f"{rows[OURS].label}, {scenes[column.scene]}, {column.n_agents} robots: "
-        f"{printed[column][OURS]:.1f} % in the paper's metric are {true[column][OURS]:.1f} % of "
-        "the free cells.",
+        f"{printed[column][OURS].value:.1f} % in the paper's metric are "
+        f"{true[column][OURS].value:.1f} % of the free cells.",
     )
 
 
 def _bound(
     rows: Mapping[str, TableRow], scenes: Mapping[str, str], means: _Means
 ) -> Iterator[Point]:
-    rivals = {
-        column: [name for name in of_rows if not rows[name].bound]
-        for column, of_rows in means["cover"].items()
-        if BOUND in of_rows
-    }
-    column = _example(one for one, names in rivals.items() if names)
-    if column is None:
+    """Compare with the bound, where the best row played as many episodes, and so the same ones."""
+    found = {}
+    for column, of_rows in means["cover"].items():
+        rivals = [name for name in of_rows if not rows[name].bound]
+        if rivals:
+            best = max(rivals, key=lambda name: of_rows[name].value)
+            gain = _gain(of_rows, BOUND, best)
+            if gain is not None:
+                found[column] = best, gain
+    shown = _example(found)
+    if shown is None:
         return
-    cover = means["cover"][column]
-    best = max(rivals[column], key=lambda name: cover[name])
+    (best, gain), cover = found[shown], means["cover"][shown]
     yield Point(
         "note",
-        f"Knowing the map is worth {_signed(cover[BOUND] - cover[best])} points of coverage",
-        f"{scenes[column.scene]}, {column.n_agents} robots: {rows[BOUND].label} covers "
-        f"{cover[BOUND]:.1f} %, the best row that searches, {rows[best].label}, "
-        f"{cover[best]:.1f} %.",
+        f"Knowing the map is worth {_signed(gain)} points of coverage",
+        f"{scenes[shown.scene]}, {shown.n_agents} robots: {rows[BOUND].label} covers "
+        f"{cover[BOUND].value:.1f} %, the best row that searches, {rows[best].label}, "
+        f"{cover[best].value:.1f} %.",
     )
 
 

@@ -8,7 +8,7 @@ const isShown = (metric) =>
 
 /** Text lines of the tooltip of a cell. */
 function explain(row, place, metric, value, seconds) {
-  const lines = [`${row.label}, ${place}`, DATA.metrics[metric] || metric];
+  const lines = [`${row.label}, ${place}`, DATA.metrics[metric] ? DATA.metrics[metric].label : metric];
   if (!value || !value.played) lines.push("not played yet");
   else if (value.mean === null) lines.push("never reached");
   else {
@@ -31,7 +31,8 @@ function explain(row, place, metric, value, seconds) {
   }
   if (row.budget) lines.push(row.budget);
   if (row.drawn) lines.push("actions are drawn, not the likeliest ones");
-  if (seconds !== null) lines.push(`${duration(seconds)} to decide on a step of the team`);
+  if (seconds !== null) lines.push(`${duration(seconds)} to decide on a step`,
+      row.batch > 1 ? `(a team\u2019s share, up to ${row.batch} teams at once)` : "(one team at a time)");
   return lines;
 }
 
@@ -93,7 +94,7 @@ function cellContent(value) {
 }
 
 const HELP = { order: "In the order of the plan",
-    decision: "Median time to decide on a step of the team, mean over the scenes" };
+    decision: "Median time to decide on a step, a team\u2019s share of its batch; the median of the scenes" };
 
 class ResultTable {
   constructor(data) {
@@ -182,8 +183,7 @@ class ResultTable {
   }
 
   decision({ row, team }) {
-    const known = row.seconds[team].filter((seconds) => seconds !== null);
-    return known.length ? known.reduce((sum, one) => sum + one, 0) / known.length : null;
+    return row.decision[team];
   }
 
   rowOf(entry, columns, teams, index) {

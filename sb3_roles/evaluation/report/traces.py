@@ -12,6 +12,7 @@ import numpy as np
 from area_search.batch import BatchedAreaSearch
 from area_search.scenes import Scene, get_scene
 from sb3_roles.evaluation.episodes import Player, held_out_seed
+from sb3_roles.evaluation.grid.crews import error_line
 from sb3_roles.evaluation.grid.entrants import Entrant, Entrants
 from sb3_roles.evaluation.grid.plan import Column, Plan
 from sb3_roles.evaluation.records import NO_ROLE
@@ -65,35 +66,43 @@ def record_traces(
     make: Callable[[Entrant], Controller],
     episodes: Sequence[int] = (0, 1, 2),
     columns: Collection[Column] | None = None,
+    tell: Callable[[str], None] = print,
 ) -> list[Trace]:
     """Play the first entrant of every row once more, in every column of the plan where it plays.
 
-    The episodes are those of the tables: numbers ``episodes`` of the plan's held-out stream.
+    The episodes are those of the tables: numbers ``episodes`` of the plan's held-out stream. A row
+    whose controller can not be made, or fails, is left out, whatever was raised.
 
     :param plan: rows and columns
     :param entrants: rows that have none are left out
     :param make: makes the controller of an entrant
     :param episodes: numbers in the stream
     :param columns: of the plan, those to play; None for all
+    :param tell: takes lines: how many episodes are played, and each row that is left out
     :return: in the order of rows, then columns, then episodes
-    :raises ValueError: for a scene whose map or horizon does not fit in bytes
     """
-    order = {row: place for place, row in enumerate(plan.rows)}
-    wanted = [cell for cell in plan.cells() if columns is None or cell[1] in columns]
-    wanted.sort(key=lambda cell: order[cell[0]])
-    controllers: dict[str, Controller] = {}
-    traces = []
-    for row, column in wanted:
-        if not entrants.get(row):
+    wanted: dict[str, list[Column]] = {row: [] for row in plan.rows}
+    for row, column in plan.cells():
+        if entrants.get(row) and (columns is None or column in columns):
+            wanted[row].append(column)
+    seed = held_out_seed(plan.seed)
+    traces: list[Trace] = []
+    n_episodes = len(episodes) * sum(map(len, wanted.values()))
+    if n_episodes:
+        tell(f"playing {n_episodes} episodes for the player")
+    for row, places in wanted.items():
+        if not places:
             continue
-        entrant = entrants[row][0]
-        if row not in controllers:
-            # Those of the row before are not needed again; a network takes its memory.
-            controllers = {row: make(entrant)}
-        scene = get_scene(column.scene, n_agents=column.n_agents)
-        traces += play_traces(
-            controllers[row], scene, entrant, column, held_out_seed(plan.seed), episodes
-        )
+        entrant, found = entrants[row][0], []
+        try:
+            controller = make(entrant)
+            for column in places:
+                scene = get_scene(column.scene, n_agents=column.n_agents)
+                found += play_traces(controller, scene, entrant, column, seed, episodes)
+        except Exception as error:
+            tell(f"{row} is left out of the player: {error_line(error, entrant)}")
+            continue
+        traces += found
     return traces
 
 

@@ -15,9 +15,10 @@ from sb3_roles.common.thresholds import first_above
 from sb3_roles.evaluation.intervals import LEVEL
 
 N_RESAMPLES = 2000
-MIN_EPISODES = 6
-"""Shared episodes that a comparison needs: with fewer, chance alone gives n differences of one sign
-more often than the tail of the interval, 2.5 %, allows (2 ** -6 is below, 2 ** -5 is not)."""
+MIN_EPISODES = 20
+"""Shared episodes that a comparison needs: percentiles of a bootstrap are too narrow with few. In
+simulations, one of two equal rows was found better in about 14 % of all cases with 6 episodes, in
+7 % with 20 and in 6 % with 30; 5 % is meant."""
 _TAIL = (1 - LEVEL) / 2
 
 

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from sb3_roles.evaluation.grid.entrants import Entrant, Played, Results
@@ -21,15 +22,6 @@ from sb3_roles.evaluation.tables.scores import (
     score_scenes,
     values_of,
 )
-
-METRIC_LABELS = {
-    "explo_paper": "Explored, paper's count (explo_paper), %",
-    "explo_true": "Truly explored (explo_true), %",
-    "cover": "Targets covered (cover), %",
-    "time_e_paper": "Time to 90 % (time_e_paper), steps",
-    "t90_true": "Time to 90 % (t90_true), steps",
-}
-"""What readers see."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +93,9 @@ class TableRow:
     :param overall: (robots, metric) -> number over all scenes of the table; only where there are
         two or more and the row played all of them, and for ``explo_paper``, ``explo_true`` and
         ``cover``
-    :param decision: column -> median seconds of a decision on a joint step of one team
+    :param decision: column -> median seconds of a decision on a joint step, a team's share of that
+        for all teams of its batch
+    :param batch: teams that were decided for together, at most; 0 if nothing was played
     """
 
     name: str
@@ -114,6 +108,16 @@ class TableRow:
     values: Mapping[tuple[Column, str], Value]
     overall: Mapping[tuple[int, str], Value]
     decision: Mapping[Column, float]
+    batch: int
+
+    def decision_over(self, columns: Iterable[Column]) -> float | None:
+        """Return the median of the decision times in some columns.
+
+        :param columns: of the table
+        :return: seconds; None if none of them was played
+        """
+        times = [self.decision[column] for column in columns if column in self.decision]
+        return statistics.median(times) if times else None
 
 
 @dataclass(frozen=True)
@@ -208,6 +212,7 @@ def _row(
         values,
         overall,
         decision,
+        max((one.records.timing["batch_size"] for ones in own for one in ones), default=0),
     )
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from sb3_roles.common.durations import short_duration
 from sb3_roles.evaluation.grid.plan import Column, Table
+from sb3_roles.evaluation.metrics import MEANINGS
 from sb3_roles.evaluation.tables.model import (
-    METRIC_LABELS,
     TableResult,
     TableRow,
     Value,
@@ -74,7 +73,7 @@ def blocks_of(table: TableResult) -> list[Block]:
             (n_agents, m) in row.overall for row in table.rows for m in table.spec.metrics
         )
         groups = {
-            METRIC_LABELS[metric]: tuple(
+            MEANINGS[metric].label: tuple(
                 Line(
                     label_of(row, table.rows),
                     row.bound,
@@ -162,5 +161,5 @@ def _number(number: float, metric: str, sign: str = "-") -> str:
 
 
 def _decision(row: TableRow, columns: Sequence[Column]) -> str:
-    times = [row.decision[column] for column in columns if column in row.decision]
-    return short_duration(statistics.median(times)) if times else ""
+    seconds = row.decision_over(columns)
+    return "" if seconds is None else short_duration(seconds)

@@ -32,6 +32,7 @@ CSV_COLUMNS = (
     "drawn",
     "bound",
     "decision_us",
+    "batch",
     "quick",
 )
 """Header of the CSV file."""
@@ -87,7 +88,7 @@ def _bullets(notes: Sequence[str]) -> str:
 
 
 def _markdown(text: str) -> str:
-    return re.sub(r"([\\|*<`])", r"\\\1", text)
+    return re.sub(r"([\\|*<`\[])", r"\\\1", text)
 
 
 def _markdown_line(line: Line) -> list[str]:
@@ -257,6 +258,7 @@ def _records(table: TableResult, row: TableRow) -> Iterator[dict[str, object]]:
                 }
             else:
                 numbers = {**_numbers(value), "decision_us": 1e6 * row.decision[column]}
+                numbers["batch"] = row.batch
             yield {**common, **place, **numbers}
         for (n_agents, name), value in row.overall.items():
             if name == metric:
