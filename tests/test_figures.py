@@ -36,7 +36,7 @@ from sb3_roles.evaluation.figures.training_logs import (
     smoothed,
 )
 from sb3_roles.evaluation.grid.entrants import Entrant, Played, Results
-from sb3_roles.evaluation.grid.plan import Column, Plan
+from sb3_roles.evaluation.grid.plan import Column, Plan, PlanError
 from sb3_roles.evaluation.grid.plan_file import parse_plan
 from sb3_roles.evaluation.intervals import estimate_mean
 from sb3_roles.evaluation.records import EpisodeRecords
@@ -573,6 +573,42 @@ def test_the_full_form_does_not_speak_of_another(
     part = replace(plan, figures={"shares": plan.figures["shares"]})
     paths = draw_figures(part, results, {}, tmp_path)
     assert not any("quick" in text for text in texts(paths[0]))
+
+
+def with_points(**points: Any) -> dict[str, Any]:
+    """Return the plan with what the paper's figure of the curves shows."""
+    curves = {**PLAN["figures"]["curves"], "paper": points}
+    return {**PLAN, "figures": {**PLAN["figures"], "curves": curves}}
+
+
+def test_what_the_paper_shows_is_drawn_and_said(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    shown = {"hmappo": {"hard": {"cover": {12: 64.1, 1: 3}}}, "mappo": {"hard": {"cover": {9: 1}}}}
+    plan, results = parse_plan(with_points(**shown)), results_of()
+    figure = plan.figures["curves"]
+    assert figure.paper["hmappo", "hard", "cover"] == ((1, 3), (12, 64.1))
+    assert "Stars: what the paper's figure shows." in caption(figure, False, plan, results, {})
+    only = replace(plan, figures={"curves": figure})
+    draw_figures(only, results, {}, tmp_path, warn=pytest.fail)
+    draw_figures(parse_plan(PLAN), results, {}, tmp_path / "without", warn=lambda line: None)
+    assert "the paper" in texts(tmp_path / "curves.svg")
+    assert "the paper" not in texts(tmp_path / "without" / "curves.svg")
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        ({"planer": {}}, "unknown row 'planer'"),
+        ({"hmappo": {"easy": {}}}, "unknown key 'easy'"),
+        ({"hmappo": {"hard": {"time": {}}}}, "unknown key 'time'"),
+        ({"hmappo": {"hard": {"cover": {0: 1}}}}, "steps from 1 on"),
+        ({"hmappo": {"hard": {"cover": {1: float("nan")}}}}, "numbers from 0"),
+        ({"hmappo": {"hard": {"cover": [1]}}}, "keys and values"),
+    ],
+)
+def test_points_that_can_not_be_drawn_are_refused(points: dict[str, Any], said: str) -> None:
+    with pytest.raises(PlanError, match=said):
+        parse_plan(with_points(**points))
 
 
 def test_figures_of_nothing_are_not_drawn(tmp_path: Path) -> None:

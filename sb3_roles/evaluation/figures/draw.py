@@ -139,6 +139,8 @@ def _drawn_how(figure: Figure, drawn: Drawn) -> list[str]:
             how.append("a dash: never")
         if any(bar.open_ended for bar in bars):
             how.append("an arrow: no known end")
+    if figure.paper:
+        how.append("stars: what the paper's figure shows")
     return how
 
 

@@ -101,6 +101,12 @@ def line_handle(look: Look, label: str) -> Any:
     return Line2D([], [], linestyle=look.dashes, label=label, **marked(look))
 
 
+def star(color: str, **options: Any) -> dict[str, Any]:
+    """Return the arguments of ``Axes.plot`` for what the paper's figure shows."""
+    looks_like = {"marker": "*", "markersize": 9.0, "markerfacecolor": "white", "linestyle": ""}
+    return {**looks_like, "color": color, "markeredgewidth": 1.0, "zorder": 5, **options}
+
+
 def legend(canvas: Canvas, handles: Sequence[Any]) -> None:
     """Put a legend below all panels, where it hides nothing."""
     # At most so many labels side by side, in lines of about the same length.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from sb3_roles.evaluation.figures.looks import (
     looks,
     marked,
     rows_of,
+    star,
     team,
 )
 from sb3_roles.evaluation.grid.plan import Figure, Plan
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
+PAPER = "the paper"
 _MARKS = 8  # markers on a line
 _MANY = 5  # lines in a panel
 _BAND = 0.18  # opacity
@@ -110,6 +112,7 @@ def _draw_episodes(canvas: Canvas, plan: Plan, figure: Figure, curves: Sequence[
                     _line(axes, curve.x, curve, look, index / len(rows), band)
                     ends = curve.mean[-1], curve.low[-1], curve.high[-1]
                     _end(side, index, ends, look)
+                    _stars(axes, figure, curve, look.color)
             axes.set_ylabel(AXES[metric])
             axes.set_title(f"{figure.scenes[place.scene]}, {team(place.n_agents)}")
             axes.set_xlabel("step" if line == len(places) - 1 else "")
@@ -124,7 +127,27 @@ def _draw_episodes(canvas: Canvas, plan: Plan, figure: Figure, curves: Sequence[
             if metric in ("explo_paper", "explo_true"):
                 for each in (axes, side):
                     each.axhline(100.0 * THRESHOLD, color="#666666", lw=0.8, ls=":", zorder=1)
-    legend(canvas, [line_handle(styles[row], plan.rows[row].label) for row in rows])
+    handles = [line_handle(styles[row], plan.rows[row].label) for row in rows]
+    legend(canvas, [*handles, *_star_handles(figure, curves)])
+
+
+def _stars(axes: Axes, figure: Figure, curve: Curve, color: str) -> None:
+    """Draw what the paper shows of a row."""
+    for step, value in _points_of(figure, curve):
+        # At the last step, half of it is beyond the panel.
+        axes.plot([step], [value], clip_on=False, **star(color))
+
+
+def _points_of(figure: Figure, curve: Curve) -> Sequence[tuple[int, float]]:
+    scene = "" if curve.column is None else curve.column.scene
+    return figure.paper.get((curve.row, scene, curve.metric), ())
+
+
+def _star_handles(figure: Figure, curves: Sequence[Curve]) -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    shown = any(_points_of(figure, curve) for curve in curves)
+    return [Line2D([], [], label=PAPER, **star("#444444"))] if shown else []
 
 
 def _end(axes: Axes, place: float, ends: tuple[float, float, float], look: Look) -> None:
@@ -156,6 +179,7 @@ def _draw_roles(canvas: Canvas, plan: Plan, figure: Figure, curves: Sequence[Cur
         for scene, curve in drawn:
             look = styles[scene]._replace(dashes=_ROLE_DASHES[curve.metric])
             _line(axes, curve.x, curve, look, scenes.index(scene) / len(scenes), _BAND)
+            _stars(axes, figure, curve, look.color)
         axes.set_title(plan.rows[row].label + (f", {team(n_agents)}" if many_teams else ""))
         axes.set_ylim(0.0, 100.0)
         axes.margins(x=0.02)
@@ -173,4 +197,4 @@ def _draw_roles(canvas: Canvas, plan: Plan, figure: Figure, curves: Sequence[Cur
             line_handle(bare._replace(dashes=_ROLE_DASHES[role]), f"role {role}")
             for role in figure.metrics
         ]
-    legend(canvas, handles)
+    legend(canvas, [*handles, *_star_handles(figure, curves)])

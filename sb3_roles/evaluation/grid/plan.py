@@ -113,6 +113,8 @@ class Figure:
     :param scenes: scene -> what readers see
     :param metrics: of ``FIGURE_METRICS[kind]``
     :param rows: names
+    :param paper: (row, scene, metric) -> what the paper's figure shows, pairs of a step from 1 on
+        and a percentage
     """
 
     name: str
@@ -122,6 +124,9 @@ class Figure:
     scenes: Mapping[str, str]
     metrics: tuple[str, ...]
     rows: tuple[str, ...]
+    paper: Mapping[tuple[str, str, str], tuple[tuple[int, float], ...]] = field(
+        default_factory=dict
+    )
 
 
 @dataclass(frozen=True)

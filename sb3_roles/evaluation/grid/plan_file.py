@@ -113,7 +113,7 @@ _PART: dict[str, Check] = {
     "rows": _NAMES,
 }
 _TABLE = {**_PART, "paper": _MAPPING}
-_FIGURE = {**_PART, "kind": _TEXT}
+_FIGURE = {**_PART, "paper": _MAPPING, "kind": _TEXT}
 
 
 def _named(what: str, content: Mapping[Any, Any]) -> dict[str, Any]:
@@ -208,14 +208,41 @@ def _printed(
                 if not isinstance(printed, list) or len(printed) != len(table["scenes"]):
                     raise PlanError(f"{place}: {metric} must have one value for each scene")
                 for scene, value in zip(table["scenes"], printed, strict=True):
-                    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-                    if not (value is None or (number and 0 <= value <= _MAX_PRINTED)):
+                    if not (value is None or _printable(value)):
                         raise PlanError(
                             f"{place}: {metric} must be null or numbers from 0 to "
                             f"{_MAX_PRINTED:.0f}, got {shown(value)}"
                         )
                     values[row, Column(scene, n_agents), metric] = value
     return values
+
+
+def _printable(value: object) -> bool:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and 0 <= value <= _MAX_PRINTED  # type: ignore[operator]
+
+
+def _points(
+    where: str, content: Mapping[Any, Any], figure: Mapping[str, Any]
+) -> dict[tuple[str, str, str], tuple[tuple[int, float], ...]]:
+    """Read what a figure of the paper shows: row -> scene -> metric -> step -> percentage."""
+    points = {}
+    _check_names(where, "row", content, figure["rows"])
+    for row, scenes in content.items():
+        scenes = _fields(f"{where}, {row}", scenes, dict.fromkeys(figure["scenes"], _MAPPING), ())
+        for scene, metrics in scenes.items():
+            place = f"{where}, {row}, {scene}"
+            known = dict.fromkeys(figure["metrics"], _MAPPING)
+            for metric, values in _fields(place, metrics, known, ()).items():
+                for step, value in values.items():
+                    wanted = _whole(1)(step)
+                    if wanted is not None or not _printable(value):
+                        raise PlanError(
+                            f"{place}: {metric} must be steps from 1 on and numbers from 0 to "
+                            f"{_MAX_PRINTED:.0f}, got {shown(step)}: {shown(value)}"
+                        )
+                points[row, scene, metric] = tuple(sorted(values.items()))
+    return points
 
 
 def _figure(name: str, content: object, rows: Mapping[str, Row]) -> Figure:
@@ -234,6 +261,8 @@ def _figure(name: str, content: object, rows: Mapping[str, Row]) -> Figure:
         for row in given["rows"]:
             if not rows[row].learned:
                 raise PlanError(f"{where}: {row} is not trained")
+    if "paper" in given and kind not in ("episode", "roles"):
+        raise PlanError(f"{where}: paper: only figures over the steps of an episode show points")
     columns = () if of_training else _columns(where, given)
     return Figure(
         name,
@@ -243,4 +272,5 @@ def _figure(name: str, content: object, rows: Mapping[str, Row]) -> Figure:
         given.get("scenes", {}),
         tuple(given["metrics"]),
         tuple(given["rows"]),
+        _points(f"{where}, paper", given.get("paper", {}), given),
     )
