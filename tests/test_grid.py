@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
+import signal
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -459,3 +462,22 @@ def _block(store: RecordStore, path: Path):
             if store.path(part.series, span) == path:
                 return part.series, span
     raise AssertionError(path)
+
+
+def test_an_interrupt_that_a_callback_swallows_stops_all_the_same(store):
+    """Python prints what is raised in a callback, and goes on."""
+    plan, seen = small_plan(), []
+
+    class Deaf(Here):
+        def wait(self):
+            done = super().wait()
+            seen.append(done.task.span)
+            with contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+            return done
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        play(plan, scripted(plan), store, make, crew=Deaf(make, store), report=lambda line: None)
+    assert len(seen) == 1
+    assert signal.getsignal(signal.SIGINT) is before

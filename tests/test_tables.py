@@ -432,7 +432,7 @@ def markdown_lines(text):
 def test_markdown_holds_the_numbers(tables):
     text = to_markdown({"I": tables["I"]})
     lines = markdown_lines(text)
-    start = lines.index(["Method", "Hard", "Easy", "All scenes", "Decision"])
+    start = lines.index(["Method", "Hard", "Easy", "Mean of 2", "Decision"])
     found = {}
     for line in lines[start + 2 :]:
         if line[0].startswith("**"):

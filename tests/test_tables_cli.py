@@ -422,6 +422,11 @@ def test_a_row_without_a_run_says_how_to_train_it_and_then_plays(tell, tmp_path)
     plan = write_plan(tmp_path, **plan_of_row)
     options = ["--plan", plan, "--quick", "--jobs", "1", "-f", "runs of mine"]
     code, _, err = tell(*options)
+    assert code == 2 and err == [
+        "sb3-roles tables: error: argument --log-folder: 'runs of mine' is no folder"
+    ]
+    (tmp_path / "runs of mine").mkdir()
+    code, _, err = tell(*options)
     assert code == 0
     (line,) = [line for line in err if line.startswith("learned has no run in runs of mine: ")]
     program, command, *words = shlex.split(line.split(": ", 1)[1])

@@ -34,8 +34,9 @@ if TYPE_CHECKING:
 LOGS = Path("logs")
 PLAN = "tables"
 """Stem of the plan's file, which is beside the configurations."""
-# Two runs that differ in these alone are runs of one configuration.
-_FREE = ("seed", "n_timesteps", "vec_env")
+# Two runs that differ in these alone are runs of one configuration. What a file of demonstrations
+# holds is noted in the run itself; who recorded them is a key of its own.
+_FREE = ("seed", "n_timesteps", "vec_env", "demonstrations")
 _N_SEEDS = 3
 
 Report = Callable[[str], None]

@@ -199,6 +199,8 @@ def make(args: Namespace) -> Made | int:
     from sb3_roles.zoo.entrants import find_entrants, make_controller, pack
     from sb3_roles.zoo.table_outputs import FIGURES, write_all
 
+    if args.log_folder != LOGS and not args.log_folder.is_dir():
+        raise UsageError(f"argument --log-folder: {str(args.log_folder)!r} is no folder")
     entrants = find_entrants(plan, args.log_folder, args.runs, _tell)
     store = RecordStore(args.out / RECORDS, _tell, set_aside=not args.dry_run)
     options: dict[str, Any] = {

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from types import FrameType
 from typing import NamedTuple
 
 import torch as th
@@ -85,6 +89,33 @@ def play(
         th.set_num_threads(threads)
 
 
+@contextmanager
+def _interruptible() -> Iterator[Callable[[], None]]:
+    """Yield what raises KeyboardInterrupt if there was a Ctrl-C.
+
+    Where it reaches Python in the middle of a callback, the exception is printed there and lost.
+    """
+    heard = False
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        nonlocal heard
+        heard = True
+        raise KeyboardInterrupt
+
+    def check() -> None:
+        if heard:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield check
+        return
+    earlier = signal.signal(signal.SIGINT, hear)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, earlier)
+
+
 def _carry_out(survey: Survey, crew: Crew, report: Report, bar: bool) -> None:
     waiting = {id(part): deque(part.missing()) for part in survey.parts()}
     running: dict[tuple[int, Span], Part] = {}
@@ -109,8 +140,9 @@ def _carry_out(survey: Survey, crew: Crew, report: Report, bar: bool) -> None:
         crew.submit(Task(id(part), part.parcel, part.series, span))
         return True
 
-    try:
+    with closing(progress), _interruptible() as check:
         while True:
+            check()
             while crew.has_room and submit_next():
                 pass
             if not running:
@@ -128,5 +160,3 @@ def _carry_out(survey: Survey, crew: Crew, report: Report, bar: bool) -> None:
             if survey.is_whole(part.cell):
                 n_episodes = part.spans[-1].last
                 progress.cell_done(part.cell, n_episodes, left())
-    finally:
-        progress.close()

@@ -48,12 +48,11 @@ def is_full(error: BaseException) -> bool:
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Tell an error of the disk which path it is about, where it does not say."""
+    """Let an error of the disk be about a path that users know: no temporary file, nor none."""
     try:
         yield
     except OSError as error:
-        if error.filename is None:
-            error.filename = str(path)
+        error.filename = str(path)
         raise
 
 

@@ -265,4 +265,8 @@ drawHonesty();
 // The page was empty when the browser looked for what its address names.
 if (/^#[\w-]+$/.test(location.hash)
     && byId(location.hash.slice(1))) byId(location.hash.slice(1)).scrollIntoView();
-if (player && location.hash.startsWith("#player=")) byId("player").scrollIntoView();
+if (player && location.hash.startsWith("#player=")) {
+  byId("player").scrollIntoView();
+  // So that the keys work at once.
+  player.stage.focus({ preventScroll: true });
+}

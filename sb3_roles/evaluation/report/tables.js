@@ -122,7 +122,7 @@ class ResultTable {
     const hasOverall = ({ m }) => this.data.rows.some((row) => row.overall.some((values) => values[m]));
     const over = metrics.filter(hasOverall);
     return columns.concat(over.map(({ metric, m }, k) => ({
-      key: `all:${metric}`, metric, group: k ? null : "All scenes", span: over.length, scene: null,
+      key: `all:${metric}`, metric, group: k ? null : `Mean of ${this.data.scenes.length}`, span: over.length, scene: null,
       value: ({ row, team }) => row.overall[team][m], seconds: () => null })));
   }
 

@@ -85,7 +85,7 @@ def blocks_of(table: TableResult) -> list[Block]:
             for metric in table.spec.metrics
         }
         scenes = [table.spec.scenes[column.scene] for column in columns]
-        header = ("Method", *scenes, *(["All scenes"] if overall else []), "Decision")
+        header = ("Method", *scenes, *([f"Mean of {len(scenes)}"] if overall else []), "Decision")
         blocks.append(Block(n_agents, header, groups))
     return blocks
 
