@@ -444,7 +444,8 @@ def test_a_row_without_a_run_says_how_to_train_it_and_then_plays(tell, tmp_path)
     kept = records_below(tmp_path / "results")
     moved = tmp_path / "elsewhere"
     (tmp_path / "runs of mine").rename(moved)
-    assert tell(*options[:-1], str(moved))[0] == 0
+    options[-1] = str(moved)
+    assert tell(*options)[0] == 0
     assert set(records_below(tmp_path / "results")) == set(kept)
     # A run may be named, too.
     code, _, err = tell(*options, "--runs", f"learned={moved}/hmappo/*_2")
