@@ -140,13 +140,13 @@ def _work(pipe: Connection, make: Make, folder: Path) -> None:
     """Play what comes through a pipe, until its other end is closed."""
     Thread(target=_die_with_parent, daemon=True).start()
     controllers, store = Controllers(make), RecordStore(folder)
-    while True:
-        try:
+    # An end that was killed is an error of the pipe, as is one that was closed.
+    with suppress(EOFError, OSError):
+        while True:
             task = pipe.recv()
-        except EOFError:
-            return
-        _, *answer = keep(play_block(task, controllers), store)
-        pipe.send(answer)
+            # Errors of the disk are part of the answer.
+            _, *answer = keep(play_block(task, controllers), store)
+            pipe.send(answer)
 
 
 def _die_with_parent() -> None:
