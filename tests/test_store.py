@@ -194,13 +194,13 @@ def test_what_a_killed_writer_left_is_removed_and_nothing_else(store, block):
     series, span = series_of(), Span(2, 4)
     store.write(series, span, block)
     folder = store.path(series, span).parent
-    stale, fresh = folder / ".0-2.parquet.ab.tmp.partial", folder / ".0-2.parquet.cd.tmp"
+    stale, fresh = folder / "0-2.parquet.7-ab.partial", folder / "0-2.parquet.8-cd.partial"
     for path in (stale, fresh):
         path.write_bytes(b"half")
     os.utime(stale, (1e9, 1e9))
     os.utime(store.path(series, span), (1e9, 1e9))
     store.clean()
-    assert files(store) == [".0-2.parquet.cd.tmp", "2-4.parquet"]
+    assert files(store) == ["0-2.parquet.8-cd.partial", "2-4.parquet"]
 
 
 def test_a_disk_that_refuses_leaves_nothing_behind(store, block, monkeypatch):

@@ -5,9 +5,15 @@ from __future__ import annotations
 import csv
 import io
 import os
+import secrets
+import time
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+# Files are written in milliseconds; a partial one of that age has lost its writer.
+_STALE_SECONDS = 600.0
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -18,8 +24,8 @@ def write_atomically(path: Path, content: bytes) -> None:
     :raises OSError: if it can not be written; an earlier file of that name is whole then
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Of this process: another one may be writing the same file.
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    # Of this call: another process, or machine, may be writing the same file.
+    partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
         partial.write_bytes(content)
         os.replace(partial, path)
@@ -29,6 +35,20 @@ def write_atomically(path: Path, content: bytes) -> None:
             # A full disk is not said to be that of any file.
             error.filename = str(path)
         raise
+
+
+def remove_stale(folder: Path, below: bool = False) -> None:
+    """Remove what killed writers of :func:`write_atomically` left, if it is some minutes old.
+
+    :param folder: of the files
+    :param below: also in all folders below it
+    """
+    latest = time.time() - _STALE_SECONDS
+    for path in folder.glob(f"{'**/' if below else ''}*.[0-9]*.partial"):
+        # Another process may clean as well, or the folder be read-only.
+        with suppress(OSError):
+            if path.stat().st_mtime < latest:
+                path.unlink()
 
 
 def csv_bytes(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> bytes:

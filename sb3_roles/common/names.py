@@ -1,4 +1,4 @@
-"""Messages for names that are not known."""
+"""Short texts for messages: unknown names, errors, spans of numbers."""
 
 from __future__ import annotations
 
@@ -22,3 +22,8 @@ def closest(what: str, name: object, allowed: Iterable[object]) -> str:
 def one_line(error: BaseException) -> str:
     """Return what an error says, for the end of a message of one line."""
     return " ".join(str(error).split())
+
+
+def span_text(low: int, high: int) -> str:
+    """Return a span of whole numbers, one number if it is one: ``1,000 to 5,000``."""
+    return f"{low:,}" if low == high else f"{low:,} to {high:,}"

@@ -21,6 +21,7 @@ from sb3_roles.zoo.options import (
     MAX_SEED,
     UsageError,
     add_scene_options,
+    names_of,
     output_file,
     scene_of,
     whole_number,
@@ -43,12 +44,12 @@ _OUTPUTS = ("out", "render")
 _OF_POLICIES = ("stochastic", "no_communication", "load_best")
 
 
-def names_of(text: str) -> list[str]:
+def controllers_of(text: str) -> list[str]:
     """Read names that are separated by commas; a folder with a comma in its name is one.
 
     :param text: the value of ``--controller``, which may be given several times
     """
-    return [text] if os.path.isdir(text) else [name.strip() for name in text.split(",")]
+    return [text] if os.path.isdir(text) else names_of(text)
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -61,7 +62,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--controller",
-        type=names_of,
+        type=controllers_of,
         action="extend",
         required=True,
         metavar="NAME|RUN",

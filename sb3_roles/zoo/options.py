@@ -92,6 +92,11 @@ def one_of(what: str, allowed: Iterable[str]) -> Callable[[str], str]:
     return name
 
 
+def names_of(text: str) -> list[str]:
+    """Read names with commas between."""
+    return [name.strip() for name in text.split(",")]
+
+
 def several_of(what: str, allowed: Iterable[str]) -> Callable[[str], tuple[str, ...]]:
     """Make the type of an option that takes some names with commas between, each of them once.
 
@@ -101,7 +106,7 @@ def several_of(what: str, allowed: Iterable[str]) -> Callable[[str], tuple[str, 
     one = one_of(what, allowed)
 
     def several(text: str) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(one(name.strip()) for name in text.split(",")))
+        return tuple(dict.fromkeys(one(name) for name in names_of(text)))
 
     return several
 

@@ -11,7 +11,7 @@ from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.common.names import closest
+from sb3_roles.common.names import closest, span_text
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import (
     CONFIG_FILE,
@@ -247,7 +247,7 @@ def describe_runs(runs: Sequence[Run]) -> str:
     :param runs: at least one
     """
     steps = sorted({run.env_steps for run in runs})
-    lengths = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
+    lengths = span_text(steps[0], steps[-1])
     planned = max(run.config["n_timesteps"] for run in runs)
     of = f" of {planned:,}" if steps[-1] < planned else ""
     seeds = ", ".join(str(run.seed) for run in runs)

@@ -12,10 +12,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.common.files import remove_stale
 from sb3_roles.evaluation.report import PAGE
 from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
 from sb3_roles.zoo.machine import usable_cores
-from sb3_roles.zoo.options import UsageError, whole_number
+from sb3_roles.zoo.options import UsageError, names_of, whole_number
 from sb3_roles.zoo.row_runs import LOGS, PLAN, config_of_row
 
 if TYPE_CHECKING:
@@ -33,11 +34,6 @@ _ABOUT = (
     "was interrupted goes on where it was. Learned rows are the runs of --log-folder with the "
     f"configuration of the row. Exit code {EXIT_ROWS_FAILED}: a row failed and is left out."
 )
-
-
-def names_of(text: str) -> list[str]:
-    """Read names with commas between."""
-    return [name.strip() for name in text.split(",")]
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -194,7 +190,7 @@ def make(args: Namespace) -> Made | int:
     # Read when they are imported: a job is one thread.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from sb3_roles.evaluation.grid.play import play
-    from sb3_roles.evaluation.grid.store import RecordStore, remove_stale
+    from sb3_roles.evaluation.grid.store import RecordStore
     from sb3_roles.evaluation.grid.survey import Survey
     from sb3_roles.zoo.entrants import find_entrants, make_controller, pack
     from sb3_roles.zoo.table_outputs import FIGURES, write_all
@@ -213,9 +209,8 @@ def make(args: Namespace) -> Made | int:
         survey = Survey(plan, entrants, store, make_controller, **options)
         print("\n".join(_lines_of(survey, jobs)))
         return EXIT_ROWS_FAILED if survey.failures else 0
-    # What ``write_atomically`` left behind.
     for folder in (args.out, args.out / FIGURES):
-        remove_stale(folder.glob("*.[0-9]*.partial"))
+        remove_stale(folder)
     try:
         with _crew(args, store) as crew:
             bar = sys.stderr.isatty()

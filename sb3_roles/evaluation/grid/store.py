@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import errno
 import os
-import secrets
-import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_roles.common.files import remove_stale
 from sb3_roles.common.names import one_line
 from sb3_roles.evaluation.grid.plan import Column
 from sb3_roles.evaluation.records import (
@@ -29,9 +28,7 @@ from sb3_roles.evaluation.records import (
     write_records,
 )
 
-SUFFIX, DAMAGED, _TEMPORARY = ".parquet", ".damaged", ".tmp"
-# Files are written in milliseconds; a temporary one of that age has lost its writer.
-_STALE_SECONDS = 600.0
+SUFFIX, DAMAGED = ".parquet", ".damaged"
 _DIGITS = 16
 # Of the machine and not of a file: the next one would fare no better.
 _STOP = (errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM)
@@ -54,19 +51,6 @@ def named(path: Path) -> Iterator[None]:
     except OSError as error:
         error.filename = str(path)
         raise
-
-
-def remove_stale(paths: Iterable[Path]) -> None:
-    """Remove temporary files of writers that were killed, if they are some minutes old.
-
-    :param paths: of temporary files
-    """
-    latest = time.time() - _STALE_SECONDS
-    for path in paths:
-        # Another process may clean as well, or the folder be read-only.
-        with suppress(OSError):
-            if path.stat().st_mtime < latest:
-                path.unlink()
 
 
 class Span(NamedTuple):
@@ -113,7 +97,7 @@ class RecordStore:
     """Keeps blocks of records, one file each.
 
     Several processes may use one store: files appear whole, and writers of the same block write the
-    same records. Nothing is deleted but temporary files that a killed writer left behind.
+    same records. Nothing is deleted but partial files that a killed writer left behind.
 
     :param folder: of the store; it is made when something is written
     :param report: takes a line for each file that can not be trusted
@@ -165,17 +149,12 @@ class RecordStore:
         :raises OSError: if the disk refuses
         """
         path = self.path(series, span)
-        temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_TEMPORARY}")
-        try:
-            with named(path):
-                write_records(records, temporary)
-                os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with named(path):
+            write_records(records, path)
 
     def clean(self) -> None:
-        """Remove temporary files of writers that were killed, see :func:`remove_stale`."""
-        remove_stale(self.folder.rglob(f".*{_TEMPORARY}*"))
+        """Remove partial files of writers that were killed, see ``files.remove_stale``."""
+        remove_stale(self.folder, below=True)
 
     def unused(self, rows: Collection[str], used: Collection[Series]) -> list[Path]:
         """Find records of the same rows that are not those of any series in use.

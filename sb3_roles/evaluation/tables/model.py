@@ -9,6 +9,7 @@ import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from sb3_roles.common.names import span_text
 from sb3_roles.evaluation.grid.entrants import Entrant, Played, Results
 from sb3_roles.evaluation.grid.plan import Column, Plan, Row, Table
 from sb3_roles.evaluation.tables.aggregate import Comparison, last_value, time_above
@@ -246,8 +247,7 @@ def _budget(entrants: Sequence[Entrant]) -> str:
     steps = sorted(each for each in runs.values() if each is not None)
     if not steps:
         return text
-    span = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
-    return f"{text} of {span} joint steps"
+    return f"{text} of {span_text(steps[0], steps[-1])} joint steps"
 
 
 def _marked(

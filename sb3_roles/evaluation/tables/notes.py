@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from sb3_roles.common.names import span_text
 from sb3_roles.evaluation.episodes import stream_of
 from sb3_roles.evaluation.grid.plan import Plan, Table
 from sb3_roles.evaluation.metrics import MEANINGS
@@ -65,7 +66,7 @@ def _episodes(
         yield f"These are fewer than the {plan.episodes} of the plan."
     fewer = [(row, counts[row.name]) for row in played if counts[row.name][0] < most]
     if fewer:
-        each = ", ".join(f"{row.label} {_span(sizes)}" for row, sizes in fewer)
+        each = ", ".join(f"{row.label} {span_text(sizes[0], sizes[-1])}" for row, sizes in fewer)
         yield f"Fewer episodes (\N{DOUBLE DAGGER}): {each}."
     columns = len(spec.columns)
     gaps = _labels(played, lambda row: len({column for column, _ in row.values}) < columns)
@@ -79,10 +80,6 @@ def most_episodes(rows: Sequence[TableRow]) -> int:
     :param rows: with their numbers; 0 without any
     """
     return max((v.n_episodes for row in rows for v in row.values.values()), default=0)
-
-
-def _span(sizes: Sequence[int]) -> str:
-    return f"{sizes[0]:,}" if sizes[0] == sizes[-1] else f"{sizes[0]:,} to {sizes[-1]:,}"
 
 
 def _labels(rows: Sequence[TableRow], which: Callable[[TableRow], bool]) -> str:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
+from sb3_roles.common.files import csv_bytes
 from sb3_roles.evaluation.tables.model import TableResult, TableRow, Value
 from sb3_roles.evaluation.tables.text import Line, Text, blocks_of
 
@@ -227,13 +226,10 @@ def to_csv(tables: Mapping[str, TableResult]) -> bytes:
     :param tables: at least one
     :return: UTF-8
     """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, CSV_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    for table in tables.values():
-        for row in table.rows:
-            writer.writerows(_records(table, row))
-    return text.getvalue().encode()
+    records = (
+        record for table in tables.values() for row in table.rows for record in _records(table, row)
+    )
+    return csv_bytes(CSV_COLUMNS, ([one.get(name) for name in CSV_COLUMNS] for one in records))
 
 
 def _records(table: TableResult, row: TableRow) -> Iterator[dict[str, object]]:
