@@ -20,6 +20,7 @@ from helpers import (
 from torch import nn
 
 from sb3_roles import HMAPPO, MAPPO, TeamWrapper
+from sb3_roles.common.team_features import TeamFeatures
 from sb3_roles.common.torch_layers import (
     NORM_LAYERS,
     FrozenBatchNorm2d,
@@ -564,3 +565,43 @@ def test_policies_ask_for_the_wrappers():
         policy_class(policy_space(), spaces.Discrete(N_MOVES), lambda _: 1e-3, **options)
     with pytest.raises(ValueError, match="RoleWrapper"):
         HMAPPO("RolePolicy", TeamWrapper(small_search()), policy_kwargs=options)
+
+
+def test_a_layer_on_team_features_is_the_layer_on_their_concatenation():
+    th.manual_seed(0)
+    layer = nn.Linear(9, 4)
+    parts = [th.randn(rows, width, requires_grad=True) for rows, width in ((6, 2), (2, 3), (6, 4))]
+    spread = [part.repeat_interleave(6 // len(part), dim=0) for part in parts]
+    expected = layer(th.cat(spread, dim=1))
+    features = TeamFeatures(6, parts)
+    th.testing.assert_close(features.linear(layer), expected)
+    th.testing.assert_close(features.rows(), th.cat(spread, dim=1))
+    assert features.size == 9
+    seeds = th.randn(6, 4)
+    wanted = th.autograd.grad((expected * seeds).sum(), [*parts, layer.weight])
+    got = th.autograd.grad((features.linear(layer) * seeds).sum(), [*parts, layer.weight])
+    for one, other in zip(got, wanted, strict=True):
+        th.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("rows", [(6, 6), (2, 2)], ids=["own", "shared"])
+def test_team_features_of_one_kind(rows):
+    th.manual_seed(0)
+    layer = nn.Linear(5, 3)
+    parts = [th.randn(n, width) for n, width in zip(rows, (2, 3), strict=True)]
+    spread = th.cat([part.repeat_interleave(6 // len(part), dim=0) for part in parts], dim=1)
+    th.testing.assert_close(TeamFeatures(6, parts).linear(layer), layer(spread))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("side", [None, 40], ids=["reference", "larger"])
+def test_prepared_observations_say_the_same(kind, side):
+    default = dict.fromkeys(("local_channels", "joint_channels", "state_channels"))
+    policy = make_policy(kind, encoder="patches", **default)
+    obs = make_observation(3, 2, side or 25, side or 25)
+    prepared = policy.prepare(obs)
+    # What has another number of patches than the encoder's reference stays a map.
+    assert prepared["joint"].ndim == (3 if side is None else 4)
+    assert_close(outputs(policy, prepared), outputs(policy, obs), atol=0)
+    twice = policy.prepare(prepared)
+    assert all(th.equal(twice[key], prepared[key]) for key in prepared)

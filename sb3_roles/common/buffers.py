@@ -32,6 +32,19 @@ class TeamSamples(NamedTuple):
     """bool (n, S)"""
 
 
+def take_groups(memory: th.Tensor, index: th.Tensor, size: int) -> th.Tensor:
+    """Gather groups of consecutive rows.
+
+    :param memory: (T, n, ...), contiguous
+    :param index: int64 (b,), numbers of groups
+    :param size: rows in a group
+    :return: (b * size, ...)
+    """
+    # Whole groups as one row each: several times faster than advanced indexing of many dimensions.
+    groups = memory.view(memory.shape[0] * memory.shape[1] // size, -1)
+    return groups.index_select(0, index).view(-1, *memory.shape[2:])
+
+
 class _MapStore:
     """The values of one key over time; maps are laid out with their channels last in memory."""
 
@@ -52,8 +65,7 @@ class _MapStore:
         :param per_team: rows of this key per team
         :return: (b * per_team, ...)
         """
-        groups = self.memory.view(-1, per_team, *self.memory.shape[2:])
-        taken = groups[index].flatten(0, 1)
+        taken = take_groups(self.memory, index, per_team)
         return taken.permute(0, 3, 1, 2) if self.is_map else taken
 
 
@@ -216,8 +228,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             yield permutation[start : start + (batch_teams or n)]
 
     def _take(self, memory: th.Tensor, index: th.Tensor) -> th.Tensor:
-        groups = memory.view(-1, self.n_agents, *memory.shape[2:])
-        return groups[index].flatten(0, 1)
+        return take_groups(memory, index, self.n_agents)
 
     def _observations_at(self, index: th.Tensor) -> dict[str, th.Tensor]:
         return {

@@ -16,6 +16,7 @@ from torch import nn
 
 from sb3_roles.common.names import closest
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY
+from sb3_roles.common.team_features import TeamFeatures
 from sb3_roles.common.team_wrapper import AGENT_KEY
 from sb3_roles.common.torch_layers import (
     NORM_LAYERS,
@@ -192,6 +193,8 @@ class TeamPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.encoders = nn.ModuleDict()
+        # Of the encoders of a key, which all cut maps alike, the first one.
+        self._map_readers: dict[str, str] = {}
         self._build_networks()
         for module in self.modules():
             if isinstance(module, (nn.Linear, nn.Conv2d)):
@@ -244,7 +247,7 @@ class TeamPolicy(ActorCriticPolicy):
         size = 0
         for key in keys:
             shape = self.observation_space[key].shape or ()
-            if len(shape) != 3:
+            if not self._is_map(key):
                 size += vector_size(self.observation_space[key])
                 continue
             style = map_style(key, shape)
@@ -253,34 +256,54 @@ class TeamPolicy(ActorCriticPolicy):
                 self.encoders[name] = make_map_encoder(
                     self.encoder, style, shape[0], self.channels[style], self.norm_layer
                 )
+            self._map_readers.setdefault(key, name)
             encoder = self.encoders[name]
             assert isinstance(encoder, (MapEncoder, PatchEncoder))
             size += encoder.out_features
         return size
 
+    def prepare(self, obs: Observation) -> dict[str, th.Tensor]:
+        """Bring observations to the form in which the encoders read them.
+
+        It is done once for a rollout instead of once for each pass over it; :meth:`streams` takes
+        observations in either form.
+
+        :param obs: tensors by key
+        :return: the same; maps that are read as patches are cut, (n, patches, size of a patch),
+            unless they have another number of patches than the encoder's reference
+        """
+        prepared = dict(obs)
+        for key, name in self._map_readers.items():
+            encoder = self.encoders[name]
+            if isinstance(encoder, PatchEncoder) and key in obs and encoder.fits(obs[key]):
+                prepared[key] = encoder.cut(self._scaled(key, obs[key])).flatten(1, 2)
+        return prepared
+
     def _encode(
-        self, owner: str, keys: Sequence[str], obs: Observation, memo: dict[str, th.Tensor]
-    ) -> th.Tensor:
+        self, owner: str, keys: Sequence[str], obs: Observation, memo: dict[Any, Any]
+    ) -> TeamFeatures:
         """Read some keys.
 
-        :param memo: encoded maps of this forward pass, so that shared encoders run once
-        :return: float (n, size)
+        :param memo: what was read in this forward pass: shared encoders run once
+        :return: n rows
         """
-        rows = obs[AGENT_KEY].shape[0]
-        parts = []
-        for key in keys:
-            value = obs[key]
-            name = self._encoder_name(owner, key)
-            if len(self.observation_space[key].shape or ()) == 3:
+        names = tuple(self._encoder_name(owner, key) if self._is_map(key) else key for key in keys)
+        if names not in memo:
+            parts = []
+            for key, name in zip(keys, names, strict=True):
                 if name not in memo:
-                    memo[name] = self.encoders[name](self._scaled(key, value))
-                part = memo[name]
-            else:
-                part = as_vectors(self.observation_space[key], value)
-            if part.shape[0] != rows:
-                part = part.repeat_interleave(rows // part.shape[0], dim=0)
-            parts.append(part)
-        return th.cat(parts, dim=1)
+                    memo[name] = (
+                        self.encoders[name](self._scaled(key, obs[key]))
+                        if self._is_map(key)
+                        else as_vectors(self.observation_space[key], obs[key])
+                    )
+                parts.append(memo[name])
+            memo[names] = TeamFeatures(obs[AGENT_KEY].shape[0], parts)
+        features: TeamFeatures = memo[names]
+        return features
+
+    def _is_map(self, key: str) -> bool:
+        return len(self.observation_space[key].shape or ()) == 3
 
     def _scaled(self, key: str, maps: th.Tensor) -> th.Tensor:
         """Bring images to [0, 1]; maps of 0 and 1 stay the bytes that they are."""
@@ -288,7 +311,8 @@ class TeamPolicy(ActorCriticPolicy):
         if not isinstance(space, spaces.Box):
             return maps
         high = float(space.high.max())
-        return maps / high if space.dtype == np.uint8 and high > 1.0 else maps
+        scale = maps.dtype == th.uint8 and space.dtype == np.uint8 and high > 1.0
+        return maps / high if scale else maps
 
     def _uses_bf16(self) -> bool:
         return resolve_precision(self.precision, self.device) == "bf16"

@@ -10,6 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_roles.common.names import closest
+from sb3_roles.common.team_features import TeamFeatures, apply_linear
 
 NORM_LAYERS = ("none", "frozen_batch", "group")
 PRECISIONS = ("auto", "fp32", "bf16")
@@ -152,11 +153,17 @@ class PatchEncoder(nn.Module):
         self.mix = mlp(channels[0] * grid * grid, channels[1:])
         self.out_features = channels[2]
 
-    def forward(self, maps: th.Tensor) -> th.Tensor:
-        """Encode maps.
+    def fits(self, maps: th.Tensor) -> bool:
+        """Whether maps, (n, in_channels, height, width), have ``grid * grid`` patches."""
+        return maps.ndim == 4 and all(
+            -(-side // self.patch) == self.grid for side in maps.shape[2:]
+        )
+
+    def cut(self, maps: th.Tensor) -> th.Tensor:
+        """Cut maps into patches, row by row; sides that are no multiples are filled with 0.
 
         :param maps: any dtype (n, in_channels, height, width), best with channels last in memory
-        :return: float (n, out_features)
+        :return: the same dtype (n, rows, columns, patch * patch * in_channels)
         """
         patch = self.patch
         last = maps.permute(0, 2, 3, 1)
@@ -166,11 +173,21 @@ class PatchEncoder(nn.Module):
             last = F.pad(last, (0, 0, 0, missing[1], 0, missing[0]))
         rows, columns = last.shape[1] // patch, last.shape[2] // patch
         patches = last.reshape(n, rows, patch, columns, patch, channels).transpose(2, 3)
+        return patches.reshape(n, rows, columns, -1)
+
+    def forward(self, maps: th.Tensor) -> th.Tensor:
+        """Encode maps.
+
+        :param maps: as :meth:`cut` takes them; or as it returns them, with rows and columns merged,
+            for maps of ``grid * grid`` patches
+        :return: float (n, out_features)
+        """
+        grid = self.grid
+        patches = maps.unflatten(1, (grid, grid)) if maps.ndim == 3 else self.cut(maps)
         # Rearranged as bytes, and only then widened.
-        flat = patches.reshape(n, rows, columns, -1).to(_compute_dtype(maps))
-        embedded = F.relu(self.embed(flat))
-        if (rows, columns) != (self.grid, self.grid):
-            pooled = F.adaptive_avg_pool2d(embedded.permute(0, 3, 1, 2), self.grid)
+        embedded = F.relu(self.embed(patches.to(_compute_dtype(maps))))
+        if embedded.shape[1:3] != (grid, grid):
+            pooled = F.adaptive_avg_pool2d(embedded.permute(0, 3, 1, 2), grid)
             embedded = pooled.permute(0, 2, 3, 1)
         return self.mix(embedded.flatten(1))
 
@@ -228,7 +245,26 @@ def symlog(x: th.Tensor) -> th.Tensor:
     return x.sign() * x.abs().log1p()
 
 
-def mlp(in_features: int, widths: Sequence[int]) -> nn.Sequential:
+class MLP(nn.Sequential):
+    """Layers in sequence; the first one may read :class:`TeamFeatures`."""
+
+    def forward(self, x: th.Tensor | TeamFeatures) -> th.Tensor:
+        """Map (n, in_features) to (n, width)."""
+        layers = list(self)
+        if isinstance(x, TeamFeatures):
+            if not layers:
+                return x.rows()
+            first = layers.pop(0)
+            assert isinstance(first, nn.Linear)
+            rows = x.linear(first)
+        else:
+            rows = x
+        for layer in layers:
+            rows = layer(rows)
+        return rows
+
+
+def mlp(in_features: int, widths: Sequence[int]) -> MLP:
     """Linear layers, each with a ReLU behind it.
 
     :param in_features: size of the input
@@ -238,7 +274,7 @@ def mlp(in_features: int, widths: Sequence[int]) -> nn.Sequential:
     for width in widths:
         layers += [nn.Linear(in_features, width), nn.ReLU(inplace=True)]
         in_features = width
-    return nn.Sequential(*layers)
+    return MLP(*layers)
 
 
 class Head(nn.Module):
@@ -258,7 +294,7 @@ class Head(nn.Module):
         self.out = nn.Linear(widths[-1] if widths else in_features, out_features)
         self.gain = gain
 
-    def forward(self, x: th.Tensor) -> th.Tensor:
+    def forward(self, x: th.Tensor | TeamFeatures) -> th.Tensor:
         """Map (n, in_features) to (n, out_features)."""
         return self.out(self.hidden(x))
 
@@ -291,20 +327,23 @@ class RoleHead(nn.Module):
         self.role = nn.Linear(n_roles, widths[0], bias=False)
         self.head = Head(widths[0], widths[1:], out_features, gain)
 
-    def forward(self, x: th.Tensor, roles: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, x: th.Tensor | TeamFeatures, roles: th.Tensor | None = None) -> th.Tensor:
         """Evaluate for one role per row, or for all of them.
 
         :param x: float (n, in_features)
         :param roles: int64 (n,); None for all roles
         :return: float (n, out_features), or (n, n_roles, out_features)
         """
-        first = self.features(x)
+        first = apply_linear(self.features, x)
         if roles is None:
             by_role = self.role.weight.t().to(first.dtype)
             return self.head(F.relu(first.unsqueeze(1) + by_role))
-        # A product with one-hots: the backward pass of indexing is ten times slower.
-        one_hot = F.one_hot(roles, self.role.in_features).to(first.dtype)
-        return self.head(F.relu(first + self.role(one_hot)))
+        # A product with one-hots: the backward pass of indexing is ten times slower. In float32: so
+        # few columns are slower to multiply as bfloat16.
+        one_hot = F.one_hot(roles, self.role.in_features).to(self.role.weight.dtype)
+        with th.autocast(one_hot.device.type, enabled=False):
+            by_role = self.role(one_hot)
+        return self.head(F.relu(first + by_role.to(first.dtype)))
 
 
 class GoalPrior(nn.Module):
@@ -331,7 +370,7 @@ class GoalPrior(nn.Module):
         if self.weights.ndim == 1 or roles is None:
             return th.einsum("...g,ngm->n...m", self.weights, flags)
         one_hot = F.one_hot(roles, len(self.weights)).to(flags.dtype)
-        return th.bmm((one_hot @ self.weights).unsqueeze(1), flags).squeeze(1)
+        return ((one_hot @ self.weights).unsqueeze(2) * flags).sum(1)
 
 
 class GraphLayer(nn.Module):
@@ -353,7 +392,9 @@ class GraphLayer(nn.Module):
         :param graph: float (n_teams, n_agents, n_agents), S
         :return: float (n_teams, n_agents, out_features)
         """
-        messages = th.bmm(graph.to(x.dtype), x)
+        # In float32: products of many small matrices are slower as bfloat16.
+        with th.autocast(x.device.type, enabled=False):
+            messages = th.bmm(graph, x.to(graph.dtype)).to(x.dtype)
         return F.relu(self.own(x) + self.others(messages))
 
 

@@ -19,6 +19,7 @@ from sb3_roles.common.distributions import (
 from sb3_roles.common.names import closest
 from sb3_roles.common.policies import Observation, Streams, TeamPolicy
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, STREAMS
+from sb3_roles.common.team_features import TeamFeatures
 from sb3_roles.common.torch_layers import GoalPrior, GraphLayer, Head, RoleHead, mlp
 
 PRIMITIVE_INPUTS = ("own", "graph")
@@ -159,7 +160,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         return GoalPrior(weights, self.n_moves)
 
     def _move_log_probs(
-        self, own: th.Tensor, roles: th.Tensor | None, obs: Observation
+        self, own: TeamFeatures, roles: th.Tensor | None, obs: Observation
     ) -> th.Tensor:
         """Return log p(move | role), (n, n_moves) for given roles or (n, n_roles, n_moves)."""
         logits = self.action_net(own, roles).float()
@@ -167,16 +168,16 @@ class RoleActorCriticPolicy(TeamPolicy):
             logits = logits + self.goal_net(obs[self.goal_key], roles)  # type: ignore[index]
         return F.log_softmax(logits, dim=-1)
 
-    def _with_role(self, features: th.Tensor, obs: Observation) -> th.Tensor:
-        return th.cat([features, obs[ROLE_KEY]], dim=1) if self.see_role else features
+    def _with_role(self, features: TeamFeatures, obs: Observation) -> TeamFeatures:
+        return features.joined(obs[ROLE_KEY]) if self.see_role else features
 
     def _actor_features(
-        self, obs: Observation, memo: dict[str, th.Tensor]
-    ) -> tuple[th.Tensor, th.Tensor]:
+        self, obs: Observation, memo: dict[Any, Any]
+    ) -> tuple[th.Tensor, TeamFeatures]:
         """Return the roles' log-probabilities (n, n_roles) and the primitive actor's input."""
         n_agents = self.team_size(obs)
-        features = self._with_role(self._encode("role", self.actor_keys, obs, memo), obs)
-        features = self.role_mlp(features)
+        seen = self._with_role(self._encode("role", self.actor_keys, obs, memo), obs)
+        features = self.role_mlp(seen)
         if self.graph:
             graph = self._graph(obs, features, n_agents)
             teams = features.view(-1, n_agents, features.shape[1])
@@ -187,10 +188,10 @@ class RoleActorCriticPolicy(TeamPolicy):
         )
         own = self._encode("primitive", self._move_keys, obs, memo)
         if self.primitive_input == "graph":
-            own = th.cat([own, features], dim=1)
+            own = own.joined(features)
         return role_log_probs, own
 
-    def _role_values(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:
+    def _role_values(self, obs: Observation, memo: dict[Any, Any]) -> th.Tensor:
         features = self._encode("value_role", self.critic_keys, obs, memo)
         return self.role_value_net(self._with_role(features, obs)).float()
 
@@ -205,7 +206,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         The primitive value to bootstrap with is the expectation over roles: the role of the next
         step is not chosen yet.
         """
-        memo: dict[str, th.Tensor] = {}
+        memo: dict[Any, Any] = {}
         choose = actions is None
         with self._autocast():
             role_log_probs, own = self._actor_features(obs, memo)

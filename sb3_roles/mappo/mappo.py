@@ -208,9 +208,9 @@ class MAPPO(OnPolicyAlgorithm):
         rollout_buffer.reset()
         callback.on_rollout_start()
         for _ in range(n_rollout_steps):
-            obs = obs_as_tensor(self._last_obs, self.device)  # type: ignore[arg-type]
+            obs = self.policy.prepare(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
             with th.inference_mode():
-                chosen = self.policy.streams(obs)  # type: ignore[arg-type]
+                chosen = self.policy.streams(obs)
             actions = chosen.actions.cpu().numpy()
             new_obs, rewards, dones, infos = env.step(self._to_env(actions))
             self.num_timesteps += env.num_envs
@@ -222,7 +222,7 @@ class MAPPO(OnPolicyAlgorithm):
             stream_rewards = th.tensor(self._stream_rewards(env, rewards), device=self.device)
             self._bootstrap(stream_rewards, dones, infos)
             ends = th.as_tensor(dones).to(self.device)
-            rollout_buffer.add_streams(obs, chosen, stream_rewards, ends)  # type: ignore[arg-type]
+            rollout_buffer.add_streams(obs, chosen, stream_rewards, ends)
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
         with th.inference_mode():

@@ -82,7 +82,7 @@ class TeamActorCriticPolicy(TeamPolicy):
         self.value_net = Head(size, self.value_arch, 1, gain=1.0)  # type: ignore[assignment]
         self.action_dist = CategoricalDistribution(n_moves)
 
-    def _log_probs(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:
+    def _log_probs(self, obs: Observation, memo: dict[Any, Any]) -> th.Tensor:
         n_agents = self.team_size(obs)
         features = self.actor_mlp(self._encode("primitive", self.actor_keys, obs, memo))
         if self.graph:
@@ -94,7 +94,7 @@ class TeamActorCriticPolicy(TeamPolicy):
             logits = logits + self.goal_net(obs[self.goal_key])  # type: ignore[index]
         return F.log_softmax(logits, dim=1)
 
-    def _values(self, obs: Observation, memo: dict[str, th.Tensor]) -> th.Tensor:
+    def _values(self, obs: Observation, memo: dict[Any, Any]) -> th.Tensor:
         return self.value_net(self._encode("value_primitive", self.critic_keys, obs, memo)).float()
 
     def streams(
@@ -104,7 +104,7 @@ class TeamActorCriticPolicy(TeamPolicy):
         deterministic: bool = False,
     ) -> Streams:
         """Evaluate the actor and the critic, see :meth:`TeamPolicy.streams`."""
-        memo: dict[str, th.Tensor] = {}
+        memo: dict[Any, Any] = {}
         with self._autocast():
             log_probs = self._log_probs(obs, memo)
             values = self._values(obs, memo)
