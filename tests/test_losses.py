@@ -8,7 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_roles.common.losses import adapt_kl_coef, lambda_returns, stream_loss
+from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, lambda_returns, stream_loss
 
 GAMMA = th.tensor([0.9, 0.7], dtype=th.float64)
 LAMBDA = th.tensor([0.95, 0.4], dtype=th.float64)
@@ -287,3 +287,24 @@ def test_the_kl_coefficient_can_come_back_from_many_timid_updates():
     for _ in range(1200):
         coefficient = adapt_kl_coef(coefficient, 0.0, 0.01)
     assert coefficient > 0.0, "it has underflowed to 0, which switches the penalty off for good"
+
+
+def test_the_losses_of_parts_add_up_to_that_of_the_whole():
+    th.manual_seed(0)
+    n, k = 12, 3
+    old, new = (th.randn(n, k).log_softmax(1) for _ in range(2))
+    rows = (th.randn(n), th.randint(0, k, (n,)), old, th.randn(n), th.randn(n), th.rand(n) < 0.6)
+
+    def loss(part: slice, *normalizers: float) -> StreamLoss:
+        values, actions, before, advantages, returns, active = (one[part] for one in rows)
+        return stream_loss(
+            *(new[part], values, actions, before, advantages, returns, active),
+            *(0.2, 0.01, 0.5, 0.3),
+            *normalizers,
+        )
+
+    whole = loss(slice(None))
+    normalizers = (float(rows[-1].sum()), n)
+    parts = [loss(slice(low, low + 4), *normalizers) for low in (0, 4, 8)]
+    for one, terms in zip(whole, zip(*parts, strict=True), strict=True):
+        th.testing.assert_close(sum(terms), one)

@@ -567,30 +567,25 @@ def test_policies_ask_for_the_wrappers():
         HMAPPO("RolePolicy", TeamWrapper(small_search()), policy_kwargs=options)
 
 
-def test_a_layer_on_team_features_is_the_layer_on_their_concatenation():
+@pytest.mark.parametrize(
+    "rows",
+    [((6, 2), (2, 3), (6, 4)), ((6, 2), (6, 3), (2, 4)), ((2, 2), (2, 3), (2, 4)), ((6, 9),)],
+    ids=["between", "last", "all", "none"],
+)
+def test_a_layer_on_team_features_is_the_layer_on_their_concatenation(rows):
     th.manual_seed(0)
     layer = nn.Linear(9, 4)
-    parts = [th.randn(rows, width, requires_grad=True) for rows, width in ((6, 2), (2, 3), (6, 4))]
+    parts = [th.randn(n, width, requires_grad=True) for n, width in rows]
     spread = [part.repeat_interleave(6 // len(part), dim=0) for part in parts]
     expected = layer(th.cat(spread, dim=1))
     features = TeamFeatures(6, parts)
     th.testing.assert_close(features.linear(layer), expected)
     th.testing.assert_close(features.rows(), th.cat(spread, dim=1))
-    assert features.size == 9
     seeds = th.randn(6, 4)
     wanted = th.autograd.grad((expected * seeds).sum(), [*parts, layer.weight])
     got = th.autograd.grad((features.linear(layer) * seeds).sum(), [*parts, layer.weight])
     for one, other in zip(got, wanted, strict=True):
         th.testing.assert_close(one, other)
-
-
-@pytest.mark.parametrize("rows", [(6, 6), (2, 2)], ids=["own", "shared"])
-def test_team_features_of_one_kind(rows):
-    th.manual_seed(0)
-    layer = nn.Linear(5, 3)
-    parts = [th.randn(n, width) for n, width in zip(rows, (2, 3), strict=True)]
-    spread = th.cat([part.repeat_interleave(6 // len(part), dim=0) for part in parts], dim=1)
-    th.testing.assert_close(TeamFeatures(6, parts).linear(layer), layer(spread))
 
 
 @pytest.mark.parametrize("kind", KINDS)

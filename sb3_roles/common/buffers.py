@@ -220,13 +220,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                     scaled = (self._advantages[..., s] - used.mean()) / (used.std() + 1e-8)
                     self._advantages[..., s] = scaled
 
-    def _index(self, batch_teams: int | None) -> Generator[th.Tensor, None, None]:
-        n = self.buffer_size * self.n_teams
-        # Drawn on the CPU: the same permutations on every device.
-        permutation = th.randperm(n).to(self.device)
-        for start in range(0, n, batch_teams or n):
-            yield permutation[start : start + (batch_teams or n)]
-
     def _take(self, memory: th.Tensor, index: th.Tensor) -> th.Tensor:
         return take_groups(memory, index, self.n_agents)
 
@@ -241,15 +234,39 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
         :param batch_teams: pairs, that is, joint steps, per minibatch
         """
-        for index in self._index(batch_teams):
-            yield TeamSamples(
-                self._observations_at(index),
-                self._take(self._actions, index),
-                tuple(self._take(memory, index) for memory in self._log_probs),
-                self._take(self._advantages, index),
-                self._take(self._returns, index),
-                self._take(self._active, index),
-            )
+        for index in self.pairs(batch_teams):
+            yield self.samples(index)
+
+    def pairs(self, batch_teams: int | None) -> Generator[th.Tensor, None, None]:
+        """Number the (time, team) pairs of minibatches, in a random order.
+
+        :param batch_teams: pairs per minibatch; None for all at once
+        :return: int64 (at most batch_teams,), see :meth:`samples`
+        """
+        n = self.buffer_size * self.n_teams
+        # Drawn on the CPU: the same permutations on every device.
+        permutation = th.randperm(n).to(self.device)
+        for start in range(0, n, batch_teams or n):
+            yield permutation[start : start + (batch_teams or n)]
+
+    def samples(self, index: th.Tensor) -> TeamSamples:
+        """Gather (time, team) pairs.
+
+        :param index: int64 (b,), of :meth:`pairs`
+        """
+        return TeamSamples(
+            self._observations_at(index),
+            self._take(self._actions, index),
+            tuple(self._take(memory, index) for memory in self._log_probs),
+            self._take(self._advantages, index),
+            self._take(self._returns, index),
+            self._take(self._active, index),
+        )
+
+    def n_active(self, index: th.Tensor) -> list[float]:
+        """Count the rows of some pairs in which each stream decided."""
+        counts: list[float] = self._take(self._active, index).sum(0).tolist()
+        return counts
 
     def spread_observations(self, most_teams: int) -> dict[str, th.Tensor]:
         """Take observations that are spread evenly over the rollout, without random numbers.
@@ -309,7 +326,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         assert self.full, "the rollout is not complete"
         teams = None if batch_size is None else max(1, batch_size // self.n_agents)
-        for index in self._index(teams):
+        for index in self.pairs(teams):
             yield DictRolloutBufferSamples(
                 observations=self._observations_at(index),
                 actions=self._take(self._actions, index),

@@ -72,8 +72,12 @@ def stream_loss(
     ent_coef: float,
     vf_coef: float,
     kl_coef: float,
+    n_active: float | None = None,
+    n_rows: int | None = None,
 ) -> StreamLoss:
     """L = L_CLIP + c1 L_KL + c2 L_VF + c3 L_E, to be minimized (Eqs. 4 and 8).
+
+    Of a part of a minibatch, all terms are shares of those of the whole: they add up to them.
 
     :param log_probs: float (n, k), normalized, of the policy that learns
     :param values: float (n,)
@@ -82,13 +86,15 @@ def stream_loss(
     :param advantages: float (n,)
     :param returns: float (n,)
     :param active: bool (n,), rows in which the stream decided; the others train its critic only
+    :param n_active: number of such rows in the whole minibatch; by default this is the whole
+    :param n_rows: number of rows in the whole minibatch; by default this is the whole
     """
     weight = active.to(values.dtype)
-    weight = weight / weight.sum().clamp(min=1.0)
+    weight = weight / (weight.sum().clamp(min=1.0) if n_active is None else max(n_active, 1.0))
     ratio = (pick(log_probs, actions) - pick(old_log_probs, actions)).exp()
     clipped = ratio.clamp(1.0 - clip_range, 1.0 + clip_range)
     policy_loss = -(weight * th.min(advantages * ratio, advantages * clipped)).sum()
-    value_loss = F.mse_loss(values, returns)
+    value_loss = F.mse_loss(values, returns, reduction="sum") / (n_rows or len(values))
     mean_entropy = (weight * entropy(log_probs)).sum()
     kl = (weight * kl_divergence(old_log_probs, log_probs)).sum()
     loss = policy_loss + kl_coef * kl + vf_coef * value_loss - ent_coef * mean_entropy

@@ -287,6 +287,7 @@ class TeamPolicy(ActorCriticPolicy):
         :param memo: what was read in this forward pass: shared encoders run once
         :return: n rows
         """
+        keys = self._own_first(keys)
         names = tuple(self._encoder_name(owner, key) if self._is_map(key) else key for key in keys)
         if names not in memo:
             parts = []
@@ -301,6 +302,13 @@ class TeamPolicy(ActorCriticPolicy):
             memo[names] = TeamFeatures(obs[AGENT_KEY].shape[0], parts)
         features: TeamFeatures = memo[names]
         return features
+
+    def _own_first(self, keys: Sequence[str]) -> list[str]:
+        """Order keys: large maps, which teams share, come last, see ``TeamFeatures``."""
+        shapes = {key: self.observation_space[key].shape or () for key in keys}
+        return sorted(
+            keys, key=lambda key: self._is_map(key) and map_style(key, shapes[key]) != "local"
+        )
 
     def _is_map(self, key: str) -> bool:
         return len(self.observation_space[key].shape or ()) == 3

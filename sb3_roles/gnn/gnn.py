@@ -262,7 +262,8 @@ class GNN(MAPPO):
             rate = self.learning_rate * self.lr_decay ** (self._n_updates // self.lr_decay_every)  # type: ignore[operator]
             update_learning_rate(self.policy.optimizer, rate)
             loss, accuracy = self._cross_entropy(*batch)
-            self._optimize(loss)
+            parameters = list(self.policy.parameters())
+            self._optimize(loss, th.autograd.grad(loss, parameters, allow_unused=True))
             self._n_updates += 1
             losses.append(loss.detach())
             right.append(accuracy)

@@ -19,6 +19,7 @@ from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
 from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
 from sb3_roles.common.policies import TeamPolicy
+from sb3_roles.common.shards import Gradients, Shards, add_gradients
 from sb3_roles.common.team_wrapper import AGENT_KEY, TeamWrapper, find_team_env
 from sb3_roles.common.torch_layers import updating_statistics
 from sb3_roles.mappo.policies import TeamActorCriticPolicy
@@ -58,6 +59,8 @@ class MAPPO(OnPolicyAlgorithm):
     :param kl_coef: first coefficient of the KL penalty; 0 switches it off
     :param kl_target: the divergence per update, in nats, that the coefficient adapts to
     :param max_grad_norm: gradients are clipped to this norm; None does not clip
+    :param n_shards: parts of a minibatch whose gradients are computed side by side, each on threads
+        of its own, and added; their number moves results by rounding
     :param target_kl: stop the epochs of an update when a minibatch diverges by more than 1.5 times
         this; None never
     :param policy_kwargs: arguments of the policy
@@ -91,6 +94,7 @@ class MAPPO(OnPolicyAlgorithm):
         kl_coef: float = 0.0,
         kl_target: float = 0.01,
         max_grad_norm: float | None = 0.5,
+        n_shards: int = 1,
         target_kl: float | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
@@ -129,9 +133,10 @@ class MAPPO(OnPolicyAlgorithm):
         self.normalize_advantage = normalize_advantage
         self.kl_coef = kl_coef
         self.kl_target = kl_target
+        self.n_shards = n_shards
         self.target_kl = target_kl
         self.kl_coefs: list[float] = []
-        check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs)
+        check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs, n_shards=n_shards)
         check_unit(gamma=gamma, gae_lambda=gae_lambda)
         check_not_negative(vf_coef=vf_coef, kl_coef=kl_coef, kl_target=kl_target)
         for name, value in (("max_grad_norm", max_grad_norm), ("target_kl", target_kl)):
@@ -263,43 +268,72 @@ class MAPPO(OnPolicyAlgorithm):
         history: list[list[StreamLoss]] = [[] for _ in settings]
         n_steps = 0
         stopped = False
-        for _ in range(self.n_epochs):
-            for batch in self.rollout_buffer.minibatches(self.batch_size):
-                now = self.policy.streams(batch.observations, batch.actions)
-                losses = [
-                    stream_loss(
-                        now.log_probs[s],
-                        now.values[:, s],
-                        batch.actions[:, s],
-                        batch.old_log_probs[s],
-                        batch.advantages[:, s],
-                        batch.returns[:, s],
-                        batch.active[:, s],
-                        stream.clip_range,
-                        stream.ent_coef,
-                        stream.vf_coef,
-                        self.kl_coefs[s],
-                    )
-                    for s, stream in enumerate(settings)
-                ]
-                for records, part in zip(history, losses, strict=True):
-                    records.append(StreamLoss(*(term.detach() for term in part)))
-                kl = sum(float(records[-1].kl) for records in history)
-                if self.target_kl is not None and kl > 1.5 * self.target_kl:
-                    stopped = True
+        with Shards(self.n_shards, self.device) as shards:
+            for _ in range(self.n_epochs):
+                for index in self.rollout_buffer.pairs(self.batch_size):
+                    losses, gradients = self._differentiate(index, settings, shards)
+                    for records, loss in zip(history, losses, strict=True):
+                        records.append(loss)
+                    kl = sum(float(loss.kl) for loss in losses)
+                    if self.target_kl is not None and kl > 1.5 * self.target_kl:
+                        stopped = True
+                        break
+                    # L = L_p + L_r (Eq. 9)
+                    self._optimize(th.stack([part.loss for part in losses]).sum(), gradients)
+                    n_steps += 1
+                self._n_updates += 1
+                if stopped:
                     break
-                # L = L_p + L_r (Eq. 9)
-                self._optimize(th.stack([part.loss for part in losses]).sum())
-                n_steps += 1
-            self._n_updates += 1
-            if stopped:
-                break
         self._update_statistics()
         self._log_update(history, n_steps)
         for s, records in enumerate(history):
             if self.kl_coefs[s] > 0:
                 kl = float(th.stack([record.kl for record in records]).mean())
                 self.kl_coefs[s] = adapt_kl_coef(self.kl_coefs[s], kl, self.kl_target)
+
+    def _differentiate(
+        self, index: th.Tensor, settings: list[StreamSettings], shards: Shards
+    ) -> tuple[list[StreamLoss], list[th.Tensor | None]]:
+        """Compute the loss of a minibatch and its gradients, shard by shard.
+
+        :param index: (time, team) pairs of the rollout
+        :return: per stream the loss, detached; per parameter the gradient
+        """
+        n_active = self.rollout_buffer.n_active(index)
+        n_rows = len(index) * self.rollout_buffer.n_agents
+        parameters = list(self.policy.parameters())
+
+        def of_shard(pairs: th.Tensor) -> tuple[list[StreamLoss], Gradients]:
+            batch = self.rollout_buffer.samples(pairs)
+            now = self.policy.streams(batch.observations, batch.actions)
+            losses = [
+                stream_loss(
+                    now.log_probs[s],
+                    now.values[:, s],
+                    batch.actions[:, s],
+                    batch.old_log_probs[s],
+                    batch.advantages[:, s],
+                    batch.returns[:, s],
+                    batch.active[:, s],
+                    stream.clip_range,
+                    stream.ent_coef,
+                    stream.vf_coef,
+                    self.kl_coefs[s],
+                    n_active[s],
+                    n_rows,
+                )
+                for s, stream in enumerate(settings)
+            ]
+            total = th.stack([part.loss for part in losses]).sum()
+            gradients = th.autograd.grad(total, parameters, allow_unused=True)
+            return [StreamLoss(*(term.detach() for term in part)) for part in losses], gradients
+
+        parts = shards.map(of_shard, index)
+        losses = [
+            StreamLoss(*(th.stack(terms).sum() for terms in zip(*of_stream, strict=True)))
+            for of_stream in zip(*(losses for losses, _ in parts), strict=True)
+        ]
+        return losses, add_gradients([gradients for _, gradients in parts])
 
     def _update_statistics(self) -> None:
         """Let frozen normalization layers see the rollout, between an update and the next one."""
@@ -309,15 +343,15 @@ class MAPPO(OnPolicyAlgorithm):
                 obs = self.rollout_buffer.spread_observations(max(2, self.batch_size))
                 self.policy.streams(obs, deterministic=True)
 
-    def _optimize(self, loss: th.Tensor) -> None:
+    def _optimize(self, loss: th.Tensor, gradients: Gradients) -> None:
         """Take one step, unless it would destroy the weights."""
         if not th.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is {loss.item()}: no step was taken; check rewards and observations, or "
                 "lower learning_rate"
             )
-        self.policy.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        for parameter, gradient in zip(self.policy.parameters(), gradients, strict=True):
+            parameter.grad = gradient
         limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), limit)
         if not th.isfinite(norm):

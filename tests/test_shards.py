@@ -1,0 +1,81 @@
+"""Shards of a minibatch: the same step as the whole minibatch, on however many threads."""
+
+from __future__ import annotations
+
+import pytest
+import torch as th
+from helpers import small_search
+
+from sb3_roles import HMAPPO, MAPPO
+from sb3_roles.common.shards import Shards, add_gradients
+
+
+def trained(algorithm, n_shards, threads, **options):
+    model = algorithm(
+        next(iter(algorithm.policy_aliases)),
+        small_search(),
+        n_steps=4,
+        batch_size=6,
+        n_epochs=2,
+        n_shards=n_shards,
+        seed=3,
+        device="cpu",
+        **options,
+    )
+    before = th.get_num_threads()
+    th.set_num_threads(threads)
+    try:
+        model.learn(2 * 4 * model.n_envs)
+        assert th.get_num_threads() == threads
+    finally:
+        th.set_num_threads(before)
+    return {name: value.clone() for name, value in model.policy.state_dict().items()}
+
+
+@pytest.mark.parametrize("algorithm", [MAPPO, HMAPPO])
+def test_threads_change_nothing(algorithm):
+    one, two = (trained(algorithm, 2, threads) for threads in (1, 2))
+    assert all(th.equal(one[name], two[name]) for name in one)
+
+
+@pytest.mark.parametrize("algorithm", [MAPPO, HMAPPO])
+def test_a_sharded_step_is_that_of_the_whole_minibatch_but_for_rounding(algorithm):
+    # Plain descent: Adam turns the rounding of tiny gradients into whole steps.
+    plain = {"policy_kwargs": {"optimizer_class": th.optim.SGD}, "learning_rate": 0.01}
+    whole = trained(algorithm, 1, 1, **plain)
+    for n_shards in (2, 5, 100):
+        sharded = trained(algorithm, n_shards, 1, **plain)
+        for name, value in whole.items():
+            th.testing.assert_close(sharded[name], value, atol=1e-5, rtol=1e-4)
+
+
+def test_every_pair_is_in_one_shard_and_results_keep_their_order():
+    index = th.arange(7)
+    with Shards(3, th.device("cpu")) as shards:
+        assert [part.tolist() for part in shards.map(lambda part: part, index)] == [
+            [0, 1, 2],
+            [3, 4],
+            [5, 6],
+        ]
+        assert len(shards.map(len, index[:2])) == 2
+
+
+def test_an_error_in_a_shard_is_raised_and_the_threads_are_given_back():
+    before = th.get_num_threads()
+
+    def fail(part):
+        raise FloatingPointError(f"{part.tolist()}")
+
+    th.set_num_threads(2)
+    try:
+        with pytest.raises(FloatingPointError, match="0"), Shards(2, th.device("cpu")) as shards:
+            shards.map(fail, th.arange(2))
+        assert th.get_num_threads() == 2
+    finally:
+        th.set_num_threads(before)
+
+
+def test_gradients_are_added_and_what_none_depends_on_has_none():
+    parts = [(th.ones(2), None, None), (th.ones(2), th.ones(1), None)]
+    first, second, third = add_gradients(parts)
+    assert first.tolist() == [2.0, 2.0] and second.tolist() == [1.0] and third is None
