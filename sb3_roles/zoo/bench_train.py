@@ -180,10 +180,10 @@ class TrainingCase:
         self.watch = Stopwatch()
         self.watch.watch("update", self.model, "train")
         self.watch.watch("environment", self.model.env, "step")
-        if hasattr(self.model, "rollout_groups"):
+        if hasattr(self.model, "player"):
             # The policy itself runs on other threads.
-            for method in ("_act", "_bootstrap", "_last_values"):
-                self.watch.watch("inference", self.model, method)
+            for method in ("act", "bootstrap", "last_values"):
+                self.watch.watch("inference", self.model.player, method)
         else:
             self.watch.watch("inference", self.model.policy, "forward")
         for method in ("add_streams", "add", "compute_stream_returns",
