@@ -11,7 +11,8 @@ import platform
 import random
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,16 @@ def set_rng_state(state: Mapping[str, Any]) -> None:
     np.random.set_state((name, keys, position, has_gauss, gauss))  # noqa: NPY002
     version, internal, gauss_next = state["python"]
     random.setstate((version, tuple(int(word) for word in internal), gauss_next))
+
+
+@contextmanager
+def kept_rng() -> Iterator[None]:
+    """Put the global generators back at the end, for what draws from them on its own behalf."""
+    state = rng_state()
+    try:
+        yield
+    finally:
+        set_rng_state(state)
 
 
 # The model

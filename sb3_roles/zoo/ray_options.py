@@ -124,8 +124,11 @@ def rollouts_on_ray(
         )
     if model.device.type != "cpu":
         raise UsageError("--rollout-workers act on CPUs, and so must the run: add --device cpu")
-    cluster = connected_to(options["ray"])
-    from sb3_roles.zoo.ray_rollouts import RayPlayer
+    from sb3_roles.common.snapshot import kept_rng
+
+    with kept_rng():
+        cluster = connected_to(options["ray"])
+        from sb3_roles.zoo.ray_rollouts import RayPlayer
 
     here, model.player = model.player, RayPlayer(model, config, workers)
     try:

@@ -21,6 +21,7 @@ from sb3_roles.common.group_play import (
 from sb3_roles.common.names import one_line
 from sb3_roles.common.ray_cluster import ray
 from sb3_roles.common.rollout_steps import Learner
+from sb3_roles.common.snapshot import kept_rng
 
 # Losses of a worker or of its machine, however many; errors of an environment are none.
 MAX_RETRIES = -1
@@ -51,6 +52,13 @@ class RayPlayer(TaskPlayer):
 
         :raises RolloutsLost: if the cluster is lost
         """
+        # Ray draws names and delays from Python's generator, which is part of checkpoints.
+        with kept_rng():
+            return self._run(tasks, weights)
+
+    def _run(
+        self, tasks: Sequence[GroupTask], weights: Mapping[str, th.Tensor]
+    ) -> list[GroupRecord]:
         sent = ray.put(dict(weights))
         # As where all groups are played in one process, see ``rollout_steps.inner_threads``.
         n_threads = 1 if len(tasks) > 1 else th.get_num_threads()
