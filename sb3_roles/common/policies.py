@@ -219,12 +219,14 @@ class TeamPolicy(ActorCriticPolicy):
         obs: Observation,
         actions: th.Tensor | None = None,
         deterministic: bool = False,
+        generator: th.Generator | None = None,
     ) -> Streams:
         """Evaluate actors and critics on the rows of whole teams.
 
         :param obs: tensors by key
         :param actions: int64 (n, S), actions to evaluate; None to choose
         :param deterministic: choose the most probable ones
+        :param generator: to choose with, of the policy's device; None for torch's own
         :return: see :class:`Streams`; with ``actions``, ``expected_values`` is not computed and
             equals ``values``
         """

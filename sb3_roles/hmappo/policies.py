@@ -199,6 +199,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         obs: Observation,
         actions: th.Tensor | None = None,
         deterministic: bool = False,
+        generator: th.Generator | None = None,
     ) -> Streams:
         """Evaluate both actors and both critics, see :meth:`TeamPolicy.streams`.
 
@@ -207,18 +208,18 @@ class RoleActorCriticPolicy(TeamPolicy):
         """
         memo: dict[Any, th.Tensor] = {}
         choose = actions is None
+
+        def chosen(log_probs: th.Tensor) -> th.Tensor:
+            return log_probs.argmax(1) if deterministic else sample_index(log_probs, generator)
+
         role_log_probs, own = self._actor_features(obs, memo)
-        if actions is None:
-            roles = role_log_probs.argmax(1) if deterministic else sample_index(role_log_probs)
-        else:
-            roles = actions[:, 0]
+        roles = chosen(role_log_probs) if actions is None else actions[:, 0]
         move_log_probs = self._move_log_probs(own, roles, obs)
         role_values = self._role_values(obs, memo)
         critic = self._encode("value_primitive", self.critic_keys, obs, memo)
         move_values = self.value_net(critic, None if choose else roles)
         if actions is None:
-            moves = move_log_probs.argmax(1) if deterministic else sample_index(move_log_probs)
-            actions = th.stack([roles, moves], dim=1)
+            actions = th.stack([roles, chosen(move_log_probs)], dim=1)
         expected = move_values
         if choose:
             by_role = move_values.squeeze(2)

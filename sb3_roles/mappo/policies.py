@@ -102,13 +102,14 @@ class TeamActorCriticPolicy(TeamPolicy):
         obs: Observation,
         actions: th.Tensor | None = None,
         deterministic: bool = False,
+        generator: th.Generator | None = None,
     ) -> Streams:
         """Evaluate the actor and the critic, see :meth:`TeamPolicy.streams`."""
         memo: dict[Any, th.Tensor] = {}
         log_probs = self._log_probs(obs, memo)
         values = self._values(obs, memo)
         if actions is None:
-            chosen = log_probs.argmax(1) if deterministic else sample_index(log_probs)
+            chosen = log_probs.argmax(1) if deterministic else sample_index(log_probs, generator)
             actions = chosen.unsqueeze(1)
         active = th.ones_like(actions, dtype=th.bool)
         return Streams(actions, (log_probs,), values, values, active)

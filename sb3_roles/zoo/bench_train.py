@@ -180,9 +180,12 @@ class TrainingCase:
         self.watch = Stopwatch()
         self.watch.watch("update", self.model, "train")
         self.watch.watch("environment", self.model.env, "step")
-        for method in ("streams", "forward"):
-            if hasattr(self.model.policy, method):
-                self.watch.watch("inference", self.model.policy, method)
+        if hasattr(self.model, "rollout_groups"):
+            # The policy itself runs on other threads.
+            for method in ("_act", "_bootstrap", "_last_values"):
+                self.watch.watch("inference", self.model, method)
+        else:
+            self.watch.watch("inference", self.model.policy, "forward")
         for method in ("add_streams", "add", "compute_stream_returns",
                        "compute_returns_and_advantage"):  # fmt: skip
             if hasattr(self.model.rollout_buffer, method):
