@@ -307,7 +307,8 @@ class TeamPolicy(ActorCriticPolicy):
         if not self._is_map(key):
             return as_vectors(self.observation_space[key], value)
         # Only here: elsewhere matrices are so small that casting costs what bfloat16 gains.
-        with th.autocast(self.device.type, th.bfloat16, enabled=self._uses_bf16()):
+        bf16 = resolve_precision(self.precision, value.device) == "bf16"
+        with th.autocast(value.device.type, th.bfloat16, enabled=bf16):
             encoded: th.Tensor = self.encoders[name](self._scaled(key, value))
         return encoded.float()
 
@@ -322,9 +323,6 @@ class TeamPolicy(ActorCriticPolicy):
         high = float(space.high.max())
         scale = maps.dtype == th.uint8 and space.dtype == np.uint8 and high > 1.0
         return maps / high if scale else maps
-
-    def _uses_bf16(self) -> bool:
-        return resolve_precision(self.precision, self.device) == "bf16"
 
     def _count_goals(self, goal_key: str | None, n_moves: int) -> int:
         """Check a key whose rows begin with flags of the moves towards sub-goals.

@@ -291,8 +291,7 @@ class MAPPO(OnPolicyAlgorithm):
                     losses, gradients = self._differentiate(index, settings, crew)
                     for records, loss in zip(history, losses, strict=True):
                         records.append(loss)
-                    kl = sum(float(loss.kl) for loss in losses)
-                    if self.target_kl is not None and kl > 1.5 * self.target_kl:
+                    if self._too_far(losses):
                         stopped = True
                         break
                     # L = L_p + L_r (Eq. 9)
@@ -307,6 +306,12 @@ class MAPPO(OnPolicyAlgorithm):
             if self.kl_coefs[s] > 0:
                 kl = float(th.stack([record.kl for record in records]).mean())
                 self.kl_coefs[s] = adapt_kl_coef(self.kl_coefs[s], kl, self.kl_target)
+
+    def _too_far(self, losses: list[StreamLoss]) -> bool:
+        """Whether to stop the epochs; without a limit, a GPU is not waited for."""
+        if self.target_kl is None:
+            return False
+        return sum(float(loss.kl) for loss in losses) > 1.5 * self.target_kl
 
     def _differentiate(
         self, index: th.Tensor, settings: list[StreamSettings], crew: ThreadCrew
