@@ -86,7 +86,10 @@ WRONG = [
         "must be the environment's, 5, got 4",
     ),
     (["--env-kwargs", "reward_sharing:same_role"], "wrapper_kwargs.reward_sharing"),
-    (["-params", "rollout_groups:129"], "rollout_groups must be at most n_envs = 128 teams, got 129"),
+    (
+        ["-params", "rollout_groups:129"],
+        "rollout_groups must be at most n_envs = 128 teams, got 129",
+    ),
     (["--rollout-workers", "2"], "--rollout-workers needs --ray ADDRESS"),
     (["--ray", "local"], "--ray needs several runs"),
     (["--ray", "local", "--n-seeds", "2", "--rollout-workers", "2"], "not both"),
