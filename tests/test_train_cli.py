@@ -86,7 +86,7 @@ WRONG = [
         "must be the environment's, 5, got 4",
     ),
     (["--env-kwargs", "reward_sharing:same_role"], "wrapper_kwargs.reward_sharing"),
-    (["-params", "rollout_groups:65"], "rollout_groups must be at most n_envs = 64 teams, got 65"),
+    (["-params", "n_envs:50", "rollout_groups:51"], "at most n_envs = 50 teams, got 51"),
     (["--rollout-workers", "2"], "--rollout-workers needs --ray ADDRESS"),
     (["--ray", "local"], "--ray needs --n-seeds K of at least 2"),
     (["--ray", "local", "--n-seeds", "2", "--rollout-workers", "2"], "not both"),

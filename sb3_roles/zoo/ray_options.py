@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -97,6 +97,28 @@ def import_ray() -> ModuleType:
     except ImportError:
         raise UsageError("argument --ray: install sb3_roles[ray] to use it") from None
     return ray_cluster
+
+
+def runs_on_ray(arguments: Sequence[str], jobs: Sequence[Mapping[str, Any]]) -> int:
+    """Train several runs side by side on a cluster.
+
+    :param arguments: of the command, which is the first one
+    :param jobs: plain data of ``zoo.train``, which differ in their seeds
+    :return: exit code
+    :raises UsageError: if there is no such cluster, or none of its machines is large enough
+    """
+    options = jobs[0]["options"]
+    cluster = connected_to(options["ray"])
+    import torch as th
+
+    from sb3_roles.zoo.ray_runs import run_on_ray
+
+    # The same as here, where a run alone would take torch's choice: sums depend on it.
+    n_threads = options["num_threads"] or th.get_num_threads()
+    try:
+        return run_on_ray(arguments, [job["config"]["seed"] for job in jobs], options, n_threads)
+    finally:
+        cluster.disconnect()
 
 
 @contextmanager

@@ -33,7 +33,7 @@ from sb3_roles.zoo.options import (
     parse_value,
     whole_number,
 )
-from sb3_roles.zoo.ray_options import add_ray_options, check_ray_options, connected_to
+from sb3_roles.zoo.ray_options import add_ray_options, check_ray_options, runs_on_ray
 from sb3_roles.zoo.run_folder import ARGS_FILE
 
 if TYPE_CHECKING:
@@ -210,7 +210,7 @@ def run(args: argparse.Namespace) -> int:
         return EXIT_ERROR
     prepare_process()
     if len(jobs) > 1 and "ray" in given:
-        return _fan_out(args, jobs)
+        return runs_on_ray(args.arguments, jobs)
     from sb3_roles.zoo.job import TrainingFailed, run_job
 
     try:
@@ -222,23 +222,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.parser.prog}: error: {error}", file=sys.stderr)
         return EXIT_DIVERGED
     return 0
-
-
-def _fan_out(args: argparse.Namespace, jobs: list[dict[str, Any]]) -> int:
-    """Train all jobs, which differ in their seeds, on a cluster."""
-    options = jobs[0]["options"]
-    cluster = connected_to(options["ray"])
-    import torch as th
-
-    from sb3_roles.zoo.ray_runs import run_on_ray
-
-    # The same as here, where a run alone would take torch's choice: sums depend on it.
-    n_threads = options["num_threads"] or th.get_num_threads()
-    seeds = [job["config"]["seed"] for job in jobs]
-    try:
-        return run_on_ray(args.arguments, seeds, options, n_threads)
-    finally:
-        cluster.disconnect()
 
 
 def _options(given: Mapping[str, Any]) -> dict[str, Any]:
