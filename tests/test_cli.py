@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from sb3_roles.baselines import CONTROLLER_NAMES
-from sb3_roles.zoo.bench_env import case_name, log_log_slope
+from sb3_roles.zoo.bench_env import case_name
+from sb3_roles.zoo.bench_report import log_log_slope
 from sb3_roles.zoo.options import key_value, parse_value
 
 ROOT = Path(__file__).resolve().parents[1]
