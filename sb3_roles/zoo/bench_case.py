@@ -6,26 +6,22 @@ Importing this module imports no torch, so that the settings that it reads can s
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from sb3_roles.zoo.bench_memory import rollout_memory
 from sb3_roles.zoo.bench_report import against, spread
 from sb3_roles.zoo.config import load_settings, merge, resolve
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.machine import describe_machine
 
-if TYPE_CHECKING:
-    from gymnasium import spaces
-
 TUNED = "hmappo native"
 # What the project aims at with its tuned default; reported as met or missed, never asserted.
 RATE_TARGETS = {TUNED: 2_500}
 RATE_AIMS = {TUNED: 4_000}
-MEMORY_TARGET = 10.0
 PARTS = ("environment", "inference", "buffer", "update")
 # Read by torch and what is below it when they are loaded.
 _VARIABLES = (
@@ -63,36 +59,6 @@ def start_torch(num_threads: int | None) -> dict[str, Any]:
         "fast_bfloat16": has_fast_bfloat16(),
         "environment": {name: os.environ[name] for name in _VARIABLES if name in os.environ},
     }
-
-
-def peak_memory() -> int | None:
-    """Return the most bytes that were resident in this process; None where nobody counts them."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024
-
-
-def dict_buffer_bytes(space: spaces.Dict, n_steps: int, n_rows: int, float32: bool) -> int:
-    """Return the bytes of observations in SB3's ``DictRolloutBuffer``, by making one.
-
-    :param space: of one row
-    :param n_steps: steps of a rollout
-    :param n_rows: robots of all teams
-    :param float32: store everything as float32, as SB3 did before 2.7.1; False for what the
-        installed version does
-    """
-    from gymnasium import spaces
-    from stable_baselines3.common.buffers import DictRolloutBuffer
-
-    if float32:
-        boxes = [(key, spaces.Box(-1.0, 1.0, box.shape)) for key, box in space.spaces.items()]
-        space = spaces.Dict(boxes)
-    # Its pages are not touched: that costs no memory.
-    buffer = DictRolloutBuffer(n_steps, space, spaces.Discrete(2), device="cpu", n_envs=n_rows)
-    return sum(array.nbytes for array in buffer.observations.values())
 
 
 class Stopwatch:
@@ -266,23 +232,9 @@ class TrainingCase:
             "share_of_time": parts,
             "observation_bytes_per_joint_step": self.buffer_bytes()
             / (self.model.n_steps * self.n_teams),
-            "memory": self._memory(),
+            "memory": rollout_memory(self.model, self.buffer_bytes()),
             "work": asdict(self.work),
         }
-
-    def _memory(self) -> dict[str, Any]:
-        own = self.buffer_bytes()
-        found: dict[str, Any] = {"observation_bytes": own}
-        shape = (self.model.observation_space, self.model.n_steps, self.env.num_envs)
-        for name, float32 in (("float32", True), ("installed", False)):
-            theirs = dict_buffer_bytes(*shape, float32)
-            found[f"dict_rollout_buffer_{name}"] = {
-                "bytes": theirs,
-                "ratio": theirs / own,
-                "target": MEMORY_TARGET,
-                "met": theirs / own >= MEMORY_TARGET,
-            }
-        return found
 
     def buffer_bytes(self) -> int:
         """Return the bytes of a rollout's observations."""

@@ -7,7 +7,6 @@ The cases run in turn (A B A B ...), so that a busy machine slows all of them al
 
 from __future__ import annotations
 
-import json
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -18,16 +17,17 @@ from sb3_roles.zoo.bench_case import (
     PARTS,
     TUNED,
     configure,
-    peak_memory,
     start_torch,
     training_case,
 )
 from sb3_roles.zoo.bench_compare import RIVALS, Comparison, comparison_table
-from sb3_roles.zoo.bench_report import Table, cells, machine_lines, page, plural
-from sb3_roles.zoo.options import UsageError, int_text, several_of, whole_number
+from sb3_roles.zoo.bench_memory import memory_cells, peak_memory
+from sb3_roles.zoo.bench_report import Table, cells, machine_lines, plural
+from sb3_roles.zoo.bench_rounds import add_round_options, print_report
+from sb3_roles.zoo.options import UsageError, int_text, several_of
 
 if TYPE_CHECKING:
-    from sb3_roles.zoo.options import Parser, Subparsers
+    from sb3_roles.zoo.options import Subparsers
 
 _BACKENDS = ("native", "supersuit")
 # What is cloned from demonstrations has no rollouts to learn from, so no steps to be measured by.
@@ -74,51 +74,6 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.set_defaults(run=run)
 
 
-def add_round_options(parser: Parser, iterations: int, repeats: int) -> None:
-    """Add what the commands that train have in common.
-
-    :param parser: of the command
-    :param iterations: default
-    :param repeats: default
-    """
-    parser.add_argument(
-        "--n-envs",
-        type=whole_number(1, 100_000),
-        default=None,
-        metavar="N",
-        help="teams that collect together (default: the configuration's)",
-    )
-    parser.add_argument(
-        "--iterations",
-        type=whole_number(1, 10_000),
-        default=iterations,
-        metavar="N",
-        help="rollouts and updates of a case in a round; slow ones make one",
-    )
-    parser.add_argument(
-        "--repeats",
-        type=whole_number(1, 1000),
-        default=repeats,
-        metavar="N",
-        help="number of rounds",
-    )
-    parser.add_argument(
-        "--num-threads",
-        type=whole_number(1, 1024),
-        default=None,
-        metavar="T",
-        help="threads of torch",
-    )
-    add_forms(parser)
-
-
-def add_forms(parser: Parser) -> None:
-    """Add the forms in which a report can be printed."""
-    forms = parser.add_mutually_exclusive_group()
-    forms.add_argument("--json", action="store_true", help="print one JSON object")
-    forms.add_argument("--markdown", action="store_true", help="print tables in Markdown")
-
-
 def run(args: Namespace) -> int:
     """Measure all cases and print the report.
 
@@ -141,10 +96,7 @@ def run(args: Namespace) -> int:
     machine = start_torch(args.num_threads)
     report = measure(configs, args.compare, args.iterations, args.repeats)
     report = {"machine": machine, **report}
-    if args.json:
-        print(json.dumps(report, indent=2, allow_nan=False))
-    else:
-        print(page(_head(report), _tables(report), args.markdown))
+    print_report(args, report, _head(report), _tables(report))
     return 0
 
 
@@ -215,7 +167,12 @@ def _tables(report: Mapping[str, Any]) -> list[Table]:
         rates.add(name, *rate, aim, f"{case['parameters']:,}")
         part = case["share_of_time"]
         shares.add(case["name"], *(f"{100 * part[name]:.1f}" for name in (*PARTS, "rest")))
-        buffers.add(case["name"], *memory_cells(case))
+        buffers.add(
+            case["name"],
+            f"{case['memory']['observation_bytes'] / 1e6:.1f}",
+            f"{case['observation_bytes_per_joint_step']:,.0f}",
+            *memory_cells(case["memory"]),
+        )
         done = case["work"]
         counts = ("joint_steps", "optimizer_steps", "samples_times_epochs")
         work.add(case["name"], *(f"{done[count]:,}" for count in counts))
@@ -223,19 +180,3 @@ def _tables(report: Mapping[str, Any]) -> list[Table]:
     if report["comparisons"]:
         tables.append(comparison_table(report["comparisons"]))
     return tables
-
-
-def memory_cells(case: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
-    """Write the memory of a case's rollout, and how many times as much ``DictRolloutBuffer`` takes.
-
-    :param case: see ``TrainingCase.describe``
-    """
-    memory = case["memory"]
-    rivals = [memory[f"dict_rollout_buffer_{name}"] for name in ("float32", "installed")]
-    verdicts = ["met" if one["met"] else "MISSED" for one in rivals]
-    return (
-        f"{memory['observation_bytes'] / 1e6:.1f}",
-        f"{case['observation_bytes_per_joint_step']:,.0f}",
-        *(f"{one['ratio']:.1f} times" for one in rivals),  # type: ignore[return-value]
-        f">= {rivals[0]['target']:g} {' / '.join(verdicts)}",
-    )
