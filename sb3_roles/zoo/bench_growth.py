@@ -76,7 +76,7 @@ def run(args: Namespace) -> int:
 
     :param args: parsed arguments
     :return: exit code
-    :raises UsageError: if a team does not fit its map, or there is nothing to draw with
+    :raises UsageError: if there is nothing to draw with
     """
     if args.plot:
         check_plots()
@@ -107,10 +107,7 @@ def run(args: Namespace) -> int:
 
 
 def _changes(n_agents: int, side: int) -> dict[str, Any]:
-    try:
-        scene = make_scene(n_agents, side)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+    scene = make_scene(n_agents, side)
     fields = ("n_agents", "height", "width", "n_targets")
     return {"env_kwargs": {"scene": "hard", **{name: getattr(scene, name) for name in fields}}}
 

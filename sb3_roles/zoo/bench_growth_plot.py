@@ -25,6 +25,7 @@ def draw(report: Mapping[str, Any], file: Path) -> None:
     :param file: ends in .png, .svg or .pdf
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     cases = report["cases"]
     side, n_agents = min(one["side"] for one in cases), min(one["n_agents"] for one in cases)
@@ -59,6 +60,8 @@ def draw(report: Mapping[str, Any], file: Path) -> None:
             axes.set(xscale="log", yscale="log", xlabel=label, title=title)
             axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
             axes.minorticks_off()
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter("{x:,.0f}")
         panels[0].set_ylabel("microseconds per joint step")
         legend(
             canvas, [line_handle(look, _LABELS.get(part, part)) for part, look in _LOOKS.items()]
