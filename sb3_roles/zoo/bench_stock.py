@@ -1,13 +1,13 @@
 """Stock PPO of Stable-Baselines3 as a rival in speed: its own buffer, update and policy class.
 
-Its networks are as large as those of the tuned default and read the same observations, map by map
-and robot by robot. It has one actor for role and move, and one critic: fewer heads, and no graph,
-because a stock buffer mixes the rows of teams. So it computes somewhat less per sample.
+Its networks read the same observations, map by map and robot by robot, through encoders and heads
+of the sizes of the tuned default's. There is no graph, because a stock buffer mixes the rows of
+teams, and nothing is conditioned on the role: it computes somewhat less per sample.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch as th
@@ -54,33 +54,45 @@ class ViewAndState(BaseFeaturesExtractor):
 
 
 class _ActorAndCritic(nn.Module):
-    """The hidden layers of both; the actor does not read the state."""
+    """Hidden layers, one column of them for each head of the tuned default.
 
-    def __init__(self, extractor: ViewAndState, actor: list[int], critic: list[int]) -> None:
+    :param extractor: what they read; actors do not read the state
+    :param actors: widths of each column
+    :param critics: the same
+    """
+
+    def __init__(
+        self,
+        extractor: ViewAndState,
+        actors: Sequence[Sequence[int]],
+        critics: Sequence[Sequence[int]],
+    ) -> None:
         super().__init__()
         self._seen = extractor.view.features_dim
-        self.actor = mlp(self._seen, actor)
-        self.critic = mlp(extractor.features_dim, critic)
-        self.latent_dim_pi, self.latent_dim_vf = actor[-1], critic[-1]
+        self.actors = nn.ModuleList(mlp(self._seen, widths) for widths in actors)
+        self.critics = nn.ModuleList(mlp(extractor.features_dim, widths) for widths in critics)
+        self.latent_dim_pi = sum(widths[-1] for widths in actors)
+        self.latent_dim_vf = sum(widths[-1] for widths in critics)
 
     def forward(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: th.Tensor) -> th.Tensor:
-        return self.actor(features[:, : self._seen])
+        seen = features[:, : self._seen]
+        return th.cat([actor(seen) for actor in self.actors], dim=1)
 
     def forward_critic(self, features: th.Tensor) -> th.Tensor:
-        return self.critic(features)
+        return th.cat([critic(features) for critic in self.critics], dim=1)
 
 
 class StockPolicy(MultiInputActorCriticPolicy):
-    """SB3's policy for Dict observations; ``net_arch`` has the lists ``pi`` and ``vf``."""
+    """SB3's policy for Dict observations; ``net_arch`` has lists of columns, ``pi`` and ``vf``."""
 
     def _build_mlp_extractor(self) -> None:
         assert isinstance(self.features_extractor, ViewAndState)
-        assert isinstance(self.net_arch, dict)
+        columns: Any = self.net_arch
         self.mlp_extractor = _ActorAndCritic(  # type: ignore[assignment]
-            self.features_extractor, self.net_arch["pi"], self.net_arch["vf"]
+            self.features_extractor, columns["pi"], columns["vf"]
         )
 
 
@@ -104,8 +116,8 @@ def stock_case(name: str, config: Mapping[str, Any], backend: str) -> TrainingCa
         "features_extractor_class": ViewAndState,
         "features_extractor_kwargs": {"encoder": own["encoder"]},
         "net_arch": {
-            "pi": [*own["role_arch"], *own["role_head_arch"]],
-            "vf": list(own["value_arch"]),
+            "pi": [[*own["role_arch"], *own["role_head_arch"]], own["primitive_arch"]],
+            "vf": [own["value_arch"], own["value_arch"]],
         },
         "activation_fn": nn.ReLU,
         "optimizer_kwargs": own.get("optimizer_kwargs"),
