@@ -85,7 +85,6 @@ WRONG = [
     (["simulate", "--render", "x.bmp"], "sb3-roles simulate: error", ".png"),
     (["simulate", "--render", "/nowhere/x.png"], "sb3-roles simulate: error", "'/nowhere'"),
     (["bench", "evn"], "sb3-roles bench: error", "did you mean 'env'?"),
-    (["bench", "evn"], "sb3-roles bench: error", "did you mean 'env'?"),
     (["bench", "env", "--seconds-per-case", "0"], "sb3-roles bench env: error", "above 0"),
     (["bench", "env", "--seconds-per-case", "inf"], "sb3-roles bench env: error", "'inf'"),
     (["bench", "env", "--repeats", "-5"], "sb3-roles bench env: error", "--repeats"),
