@@ -6,6 +6,7 @@ Importing this module imports no torch, so that the settings that it reads can s
 from __future__ import annotations
 
 import os
+import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -128,6 +129,7 @@ class TrainingCase:
         self.rates: list[float] = []
         self.rollout_costs: list[float] = []
         self.update_costs: list[float] = []
+        self.cpu_shares: list[float] = []
         self.work, self.seconds = Work(), 0.0
         self._train(1)
         self.watch = Stopwatch()
@@ -185,7 +187,7 @@ class TrainingCase:
         if num_threads is not None:
             th.set_num_threads(num_threads)
         updates = self.watch.seconds["update"]
-        start = time.perf_counter()
+        cpu, start = time.process_time(), time.perf_counter()
         try:
             self._train(iterations)
         finally:
@@ -194,6 +196,7 @@ class TrainingCase:
         done = iterations * self.model.n_steps * self.n_teams
         updates = self.watch.seconds["update"] - updates
         self.rates.append(done / seconds)
+        self.cpu_shares.append((time.process_time() - cpu) / seconds)
         self.update_costs.append(updates / done)
         self.rollout_costs.append((seconds - updates) / done)
         self.work.joint_steps += done
@@ -229,6 +232,8 @@ class TrainingCase:
             "parameters": sum(one.numel() for one in self.model.policy.parameters()),
             "joint_steps_per_second": against(rate, RATE_TARGETS.get(self.name)),
             "aim": None if aim is None else against(rate, aim),
+            # Processors in use: far below the number of threads, others had them.
+            "cpu_share": statistics.median(self.cpu_shares),
             "share_of_time": parts,
             "observation_bytes_per_joint_step": self.buffer_bytes()
             / (self.model.n_steps * self.n_teams),

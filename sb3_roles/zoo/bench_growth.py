@@ -87,7 +87,7 @@ def run(args: Namespace) -> int:
     with ExitStack() as stack:
         cases = {}
         for size, config in configs.items():
-            fitting = _fitted(config, size, args.n_envs, len(configs))
+            fitting = _fitted(config, size, len(configs))
             cases[size] = stack.enter_context(closing(GrowthCase(size, fitting)))
         for _ in range(args.repeats):
             for case in cases.values():
@@ -112,9 +112,7 @@ def _changes(n_agents: int, side: int) -> dict[str, Any]:
     return {"env_kwargs": {"scene": "hard", **{name: getattr(scene, name) for name in fields}}}
 
 
-def _fitted(
-    config: dict[str, Any], size: tuple[int, int], n_envs: int | None, n_cases: int
-) -> dict[str, Any]:
+def _fitted(config: dict[str, Any], size: tuple[int, int], n_cases: int) -> dict[str, Any]:
     """Return the configuration with as many teams as fit the memory."""
     available = available_memory()
     teams: int = config["n_envs"]

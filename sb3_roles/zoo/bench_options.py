@@ -94,6 +94,8 @@ def run(args: Namespace) -> int:
         for name, change in changes.items()
     }
     machine = start_torch(args.num_threads)
+    same = _same_as_default(changes, configs)
+    configs = {name: config for name, config in configs.items() if name not in same}
     with ExitStack() as stack:
         cases = {
             name: stack.enter_context(closing(training_case(name, config)))
@@ -106,12 +108,25 @@ def run(args: Namespace) -> int:
             "config": {"iterations": args.iterations, "repeats": args.repeats},
             "machine": machine,
             "default": {**cases[DEFAULT].describe(), "config": configs[DEFAULT]},
-            "changes": [
-                _describe(name, changes[name], cases) for name in changes if name != DEFAULT
-            ],
+            "changes": [_describe(name, changes[name], cases) for name in cases if name != DEFAULT],
+            "same_as_default": same,
         }
     print_report(args, report, _head(report), [_table(report)])
     return 0
+
+
+def _same_as_default(
+    changes: Mapping[str, Change], configs: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    """Name the changes that change nothing."""
+    from sb3_roles.zoo.models import complete
+
+    default = complete(configs[DEFAULT])
+    return [
+        name
+        for name, change in changes.items()
+        if name != DEFAULT and change.num_threads is None and complete(configs[name]) == default
+    ]
 
 
 def _describe(name: str, change: Change, cases: Mapping[str, TrainingCase]) -> dict[str, Any]:
@@ -126,12 +141,13 @@ def _describe(name: str, change: Change, cases: Mapping[str, TrainingCase]) -> d
 
 
 def _head(report: Mapping[str, Any]) -> list[str]:
-    config = report["config"]
-    return [
+    config, same = report["config"], report["same_as_default"]
+    head = [
         *machine_lines(report["machine"]),
         f"{plural(config['repeats'], 'interleaved round')} of "
         f"{plural(config['iterations'], 'iteration')}",
     ]
+    return head + ([f"the default already: {', '.join(same)}"] if same else [])
 
 
 def _table(report: Mapping[str, Any]) -> Table:

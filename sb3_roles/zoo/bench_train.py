@@ -152,8 +152,9 @@ def _head(report: Mapping[str, Any]) -> list[str]:
 
 def _tables(report: Mapping[str, Any]) -> list[Table]:
     rates = Table(
-        ("joint steps per second of training", "median", "range", "target", "aim", "parameters")
-    )
+        ("joint steps per second of training", "median", "range", "target", "aim", "CPU share",
+         "parameters")
+    )  # fmt: skip
     shares = Table(("share of the time, %", *PARTS, "rest"))
     buffers = Table(
         ("observations of a rollout", "MB", "bytes/joint step", "float32, SB3 before 2.7.1",
@@ -164,7 +165,7 @@ def _tables(report: Mapping[str, Any]) -> list[Table]:
         name = f"{case['name']}, {case['n_teams']} teams of {case['n_agents']}"
         rate = cells(case["joint_steps_per_second"], ",.0f")
         aim = "" if case["aim"] is None else cells(case["aim"], ",.0f")[2]
-        rates.add(name, *rate, aim, f"{case['parameters']:,}")
+        rates.add(name, *rate, aim, f"{case['cpu_share']:.2f}", f"{case['parameters']:,}")
         part = case["share_of_time"]
         shares.add(case["name"], *(f"{100 * part[name]:.1f}" for name in (*PARTS, "rest")))
         buffers.add(
