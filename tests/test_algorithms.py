@@ -693,7 +693,7 @@ def test_a_timid_update_halves_the_coefficients_of_the_penalty():
 
 
 def test_the_coefficients_follow_the_logged_divergence():
-    model = make_model(learning_rate=3e-3, kl_coef=0.5, kl_target=0.01, n_epochs=4)
+    model = make_model(learning_rate=1e-2, kl_coef=0.5, kl_target=0.01, n_epochs=4)
     logs = record_logs(model)
     model.learn(6 * 10 * model.n_envs)
     changes = set()

@@ -20,7 +20,6 @@ from helpers import (
 from torch import nn
 
 from sb3_roles import HMAPPO, MAPPO, TeamWrapper
-from sb3_roles.common.team_features import TeamFeatures
 from sb3_roles.common.torch_layers import (
     NORM_LAYERS,
     FrozenBatchNorm2d,
@@ -565,27 +564,6 @@ def test_policies_ask_for_the_wrappers():
         policy_class(policy_space(), spaces.Discrete(N_MOVES), lambda _: 1e-3, **options)
     with pytest.raises(ValueError, match="RoleWrapper"):
         HMAPPO("RolePolicy", TeamWrapper(small_search()), policy_kwargs=options)
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [((6, 2), (2, 3), (6, 4)), ((6, 2), (6, 3), (2, 4)), ((2, 2), (2, 3), (2, 4)), ((6, 9),)],
-    ids=["between", "last", "all", "none"],
-)
-def test_a_layer_on_team_features_is_the_layer_on_their_concatenation(rows):
-    th.manual_seed(0)
-    layer = nn.Linear(9, 4)
-    parts = [th.randn(n, width, requires_grad=True) for n, width in rows]
-    spread = [part.repeat_interleave(6 // len(part), dim=0) for part in parts]
-    expected = layer(th.cat(spread, dim=1))
-    features = TeamFeatures(6, parts)
-    th.testing.assert_close(features.linear(layer), expected)
-    th.testing.assert_close(features.rows(), th.cat(spread, dim=1))
-    seeds = th.randn(6, 4)
-    wanted = th.autograd.grad((expected * seeds).sum(), [*parts, layer.weight])
-    got = th.autograd.grad((features.linear(layer) * seeds).sum(), [*parts, layer.weight])
-    for one, other in zip(got, wanted, strict=True):
-        th.testing.assert_close(one, other)
 
 
 @pytest.mark.parametrize("kind", KINDS)

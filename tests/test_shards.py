@@ -7,7 +7,10 @@ import torch as th
 from helpers import small_search
 
 from sb3_roles import HMAPPO, MAPPO
-from sb3_roles.common.shards import Shards, add_gradients
+from sb3_roles.common.shards import add_gradients, shards_of
+from sb3_roles.common.threads import ThreadCrew
+
+CPU = th.device("cpu")
 
 
 def trained(algorithm, n_shards, threads, **options):
@@ -50,14 +53,11 @@ def test_a_sharded_step_is_that_of_the_whole_minibatch_but_for_rounding(algorith
 
 
 def test_every_pair_is_in_one_shard_and_results_keep_their_order():
-    index = th.arange(7)
-    with Shards(3, th.device("cpu")) as shards:
-        assert [part.tolist() for part in shards.map(lambda part: part, index)] == [
-            [0, 1, 2],
-            [3, 4],
-            [5, 6],
-        ]
-        assert len(shards.map(len, index[:2])) == 2
+    shards = shards_of(th.arange(7), 3)
+    assert [part.tolist() for part in shards] == [[0, 1, 2], [3, 4], [5, 6]]
+    assert len(shards_of(th.arange(2), 3)) == 2
+    with ThreadCrew(2, CPU) as crew:
+        assert crew.map(lambda part: part.sum().item(), shards) == [3, 7, 11]
 
 
 def test_an_error_in_a_shard_is_raised_and_the_threads_are_given_back():
@@ -68,8 +68,8 @@ def test_an_error_in_a_shard_is_raised_and_the_threads_are_given_back():
 
     th.set_num_threads(2)
     try:
-        with pytest.raises(FloatingPointError, match="0"), Shards(2, th.device("cpu")) as shards:
-            shards.map(fail, th.arange(2))
+        with pytest.raises(FloatingPointError, match="0"), ThreadCrew(2, CPU) as crew:
+            crew.map(fail, shards_of(th.arange(2), 2))
         assert th.get_num_threads() == 2
     finally:
         th.set_num_threads(before)

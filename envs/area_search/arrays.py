@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from area_search import assignment, kernels, paths
 from area_search import cells as layout
+from area_search import kernels, paths
 from area_search.cells import N_ACTIONS
 from area_search.rewards import MAX_ROLES, REWARD_COMPONENTS
 from area_search.scenes import Scene, unknown
+from area_search.team_slices import SliceThreads, TeamSlice, check_threads, even_slices
 
 # Everything that the future of a run depends on, and what the last step reported. All else is
 # derived from it.
@@ -75,11 +76,19 @@ class TeamArrays:
     :param n_teams: number of teams
     :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
     :param known_map: observe the key ``known``, too
+    :param n_threads: see :attr:`n_threads`
     """
 
     team_observation_keys: tuple[str, ...] = ("joint", "state")
 
-    def __init__(self, scene: Scene, n_teams: int, sub_goal: str, known_map: bool = False) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        n_teams: int,
+        sub_goal: str,
+        known_map: bool = False,
+        n_threads: int = 1,
+    ) -> None:
         self.scene = scene
         self.n_teams = n_teams
         self.n_agents = scene.n_agents
@@ -87,6 +96,7 @@ class TeamArrays:
         self.known_map = False
         self.observation_space = observation_space(scene, sub_goal)
         self._started = False
+        self._n_threads = n_threads
         self._allocate()
         if known_map:
             self.show_known_map()
@@ -140,69 +150,19 @@ class TeamArrays:
 
     def _bind_kernels(self) -> None:
         """Gather each kernel's arguments once: they are the same arrays at every step."""
-        scene = self.scene
-        maps = (self.cells, self._unseen, self._joint, self._state, self._goals, self.position)
-        self._reset_arguments: tuple[Any, ...] = (
-            self.keys,
-            self.episodes,
-            scene.n_free,
-            scene.n_targets,
-            float(scene.spawn_sigma),
-            float(scene.spawn_sigma_growth),
-            self._border,
-            layout.disc_offsets(scene.sensor_radius),
-            *maps,
-            self.idle,
-            self.steps,
-            self.totals,
-            np.zeros(scene.n_cells, np.int64),  # free_cells
-        )
-        edges, edge_counts = layout.edge_offsets(layout.disc_offsets(scene.sensor_radius))
-        self._step_arguments: tuple[Any, ...] = (
-            self._border,
-            edges,
-            edge_counts,
-            scene.horizon,
-            scene.early_stop_patience or 0,
-            scene.n_free,
-            scene.n_targets,
-            float(scene.explore_normalizer),
-            scene.reward_sharing == "same_role",
-            float(scene.alpha),
-            float(scene.beta),
-            self.roles,
-            *maps,
-            self.idle,
-            self.steps,
-            self.totals,
-            self.new_cells,
-            self.new_targets,
-            self.reward_components,
-            self.rewards,
-            self.metric_values,
-            self.terminated,
-            self.truncated,
-            np.zeros(edges.shape[1:], np.int64),  # fresh
-        )
-        self._observe_arguments: tuple[Any, ...] = (
-            self.cells,
-            self.position,
-            self._border,
-            layout.window_table(),
-            layout.window_masks(scene.view_radius, scene.communication_radius),
-            self._local_words,
-            self._coordinates,
-        )
-        if self.sub_goal != "none":
-            scratch = paths.search_scratch(self.sub_goal, self.n_agents, self.cells[0].size)
-            self._sub_goal_arguments: tuple[Any, ...] = (
-                self.cells,
-                self._border,
-                self.position,
-                self._goals,
-                *scratch,
-                self.observations["sub_goal"],
-            )
+        parts = even_slices(self.n_teams, self._n_threads)
+        self._threads = SliceThreads([TeamSlice(self, part) for part in parts])
+
+    @property
+    def n_threads(self) -> int:
+        """Threads that work on the teams of a step; what they compute does not depend on it."""
+        return self._n_threads
+
+    @n_threads.setter
+    def n_threads(self, n_threads: int) -> None:
+        if n_threads != self._n_threads:
+            self._n_threads = check_threads(n_threads)
+            self._bind_kernels()
 
     def show_known_map(self) -> None:
         """Observe the key ``known`` from now on, if it is not observed yet.
@@ -219,17 +179,12 @@ class TeamArrays:
         self._known = np.zeros(size, np.uint8)
         self.observations["known"] = np.moveaxis(self._known, -1, -3)
         self.first_team["known"] = self.observations["known"][0]
+        self._bind_kernels()
         if self._started:
             kernels.observe_known(self._everyone, self.cells, self._border, self._known)
 
     def _observe(self, which: np.ndarray) -> None:
-        kernels.observe_teams(which, *self._observe_arguments)
-        if self.known_map:
-            kernels.observe_known(which, self.cells, self._border, self._known)
-        if self.sub_goal == "nearest":
-            paths.nearest_sub_goals(which, *self._sub_goal_arguments)
-        elif self.sub_goal == "assigned":
-            assignment.assigned_sub_goals(which, *self._sub_goal_arguments)
+        self._threads.run(lambda part: part.observe(which))
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Copy the whole simulation.
@@ -293,6 +248,7 @@ class TeamArrays:
             "n_teams": self.n_teams,
             "sub_goal": self.sub_goal,
             "known_map": self.known_map,
+            "n_threads": self.n_threads,
         }
         return {"options": options, "arrays": self.get_state() if self._started else None}
 

@@ -19,7 +19,7 @@ from area_search.matching import (
 from area_search.paths import SCALE, encode, search
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def assigned_sub_goals(
     which: np.ndarray,
     cells: np.ndarray,

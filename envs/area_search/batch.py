@@ -17,6 +17,7 @@ from area_search.render import Window, draw_frame
 from area_search.rewards import MAX_ROLES, REWARD_COMPONENTS
 from area_search.scenes import Scene, get_scene, shown
 from area_search.snapshot import Snapshot
+from area_search.team_slices import TeamSlice, check_threads
 
 MAX_EPISODE = 2**62
 
@@ -32,6 +33,7 @@ class BatchedAreaSearch(TeamArrays):
     :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``; which path features
         (``area_search.paths``) join the observation
     :param known_map: observe the team's map under the key ``known``, see :meth:`show_known_map`
+    :param n_threads: threads that work on the teams of a step; it changes no result
     :param scene_options: fields of the scene to change
     :raises ValueError: if an option is unknown or out of range
     """
@@ -45,11 +47,13 @@ class BatchedAreaSearch(TeamArrays):
         n_teams: int = 1,
         sub_goal: str = "none",
         known_map: bool = False,
+        n_threads: int = 1,
         **scene_options: Any,
     ) -> None:
         if isinstance(n_teams, bool) or not isinstance(n_teams, int) or n_teams < 1:
             raise ValueError(f"n_teams must be a whole number of at least 1, got {n_teams!r}")
-        super().__init__(get_scene(scene, **scene_options), n_teams, sub_goal, known_map)
+        scene = get_scene(scene, **scene_options)
+        super().__init__(scene, n_teams, sub_goal, known_map, check_threads(n_threads))
         self.possible_agents = [f"robot_{i}" for i in range(self.n_agents)]
         self.action_space = spaces.Discrete(N_ACTIONS)
         self._window: Window | None = None
@@ -111,10 +115,13 @@ class BatchedAreaSearch(TeamArrays):
         self._begin(which)
 
     def _begin(self, which: np.ndarray) -> None:
-        kernels.reset_teams(which, *self._reset_arguments)
+        def begin(part: TeamSlice) -> None:
+            part.begin(which)
+            part.observe(which)
+
         self.roles[which] = 0
+        self._threads.run(begin)
         self._started = True
-        self._observe(which)
 
     def step(self, actions: np.ndarray) -> None:
         """Move all robots once. Ended teams are not reset: see :meth:`reset_teams`.
@@ -127,8 +134,13 @@ class BatchedAreaSearch(TeamArrays):
         :raises ValueError: if the shape, type or a value is wrong
         """
         self._check_started()
-        kernels.step_teams(self._checked_actions(actions), *self._step_arguments)
-        self._observe(self._everyone)
+        checked = self._checked_actions(actions)
+
+        def step(part: TeamSlice) -> None:
+            part.step(checked)
+            part.observe(self._everyone)
+
+        self._threads.run(step)
 
     def _check_started(self) -> None:
         if not self._started:

@@ -1,7 +1,8 @@
 """Numba kernels that advance a batch of teams by one step and keep its maps up to date.
 
-Serial on purpose: parallel njit kills forked workers. Nothing here allocates. Every map that an
-observation shows is kept current in place, so a step costs what changed and not the map's area.
+Serial on purpose: parallel njit kills forked workers (``team_slices`` has threads of Python).
+Nothing here allocates. Every map that an observation shows is kept current in place, so a step
+costs what changed and not the map's area.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ NEVER = -1
 METRICS = ("explo_paper", "explo_true", "cover")
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def rebuild(
     cells: np.ndarray,
     unseen: np.ndarray,
@@ -81,7 +82,7 @@ def rebuild(
             state[row, column, 4] = (cell & EXPLORED) > 0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def reset_teams(
     which: np.ndarray,
     keys: np.ndarray,
@@ -211,7 +212,7 @@ def first_invalid(actions: np.ndarray, n_actions: int) -> int:
     return -1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def step_teams(
     actions: np.ndarray,
     border: int,
@@ -316,7 +317,7 @@ def step_teams(
         weighted_reward(components[m], alpha, beta, rewards[m])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def observe_teams(
     which: np.ndarray,
     cells: np.ndarray,
@@ -352,7 +353,7 @@ def observe_teams(
                     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def observe_known(which: np.ndarray, cells: np.ndarray, border: int, known: np.ndarray) -> None:
     """Write the team's map of some teams: where cells are known to be free, and to be obstacles.
 

@@ -184,7 +184,7 @@ def encode(out: np.ndarray, distance: int, moves: int, table: np.ndarray) -> Non
         out[N_ACTIONS] = table[min(distance, table.shape[0] - 1)] / SCALE
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def nearest_sub_goals(
     which: np.ndarray,
     cells: np.ndarray,

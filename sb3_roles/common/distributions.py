@@ -27,14 +27,15 @@ def role_log_probabilities(logits: th.Tensor, held: th.Tensor, due: th.Tensor) -
     return th.where(due.unsqueeze(1), F.log_softmax(logits, dim=1), goes_on)
 
 
-def sample_index(log_probs: th.Tensor) -> th.Tensor:
+def sample_index(log_probs: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
     """Draw one index per row: one uniform number against the cumulative probabilities.
 
     :param log_probs: float (n, k), normalized
+    :param generator: of the same device; None for torch's own
     :return: int64 (n,)
     """
     total = log_probs.exp().cumsum(1)
-    uniform = th.rand(len(total), 1, device=total.device) * total[:, -1:]
+    uniform = th.rand(len(total), 1, device=total.device, generator=generator) * total[:, -1:]
     return (total <= uniform).sum(1).clamp(max=total.shape[1] - 1)
 
 

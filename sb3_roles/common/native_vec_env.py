@@ -15,7 +15,8 @@ class BatchedTeamEnv(Protocol):
     The batched form of an environment, what its ``batched(n_teams)`` returns.
 
     Arrays may be overwritten in place by the next call; the caller copies. ``render_mode``,
-    ``metadata`` and ``goal_nearness`` are optional attributes.
+    ``metadata``, ``goal_nearness`` and ``n_threads`` (threads that a step may use without changing
+    its results; training sets it) are optional attributes.
     """
 
     n_teams: int

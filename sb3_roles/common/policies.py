@@ -16,7 +16,6 @@ from torch import nn
 
 from sb3_roles.common.names import closest
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY
-from sb3_roles.common.team_features import TeamFeatures
 from sb3_roles.common.team_wrapper import AGENT_KEY
 from sb3_roles.common.torch_layers import (
     NORM_LAYERS,
@@ -82,8 +81,8 @@ class TeamPolicy(ActorCriticPolicy):
     :param local_channels: sizes of the layers of the encoder for small maps
     :param joint_channels: the same for large maps
     :param state_channels: the same for the key ``state``
-    :param precision: ``"fp32"``, ``"bf16"`` (autocast; weights, losses and probabilities stay
-        float32), or ``"auto"``: bf16 where the hardware multiplies it
+    :param precision: of the products in the map encoders: ``"fp32"``, ``"bf16"`` (their weights and
+        everything else stay float32), or ``"auto"``: bf16 where the hardware multiplies it
     :param optimizer_kwargs: further arguments of Adam
     :raises ValueError: if a key or an option is unknown
     """
@@ -220,12 +219,14 @@ class TeamPolicy(ActorCriticPolicy):
         obs: Observation,
         actions: th.Tensor | None = None,
         deterministic: bool = False,
+        generator: th.Generator | None = None,
     ) -> Streams:
         """Evaluate actors and critics on the rows of whole teams.
 
         :param obs: tensors by key
         :param actions: int64 (n, S), actions to evaluate; None to choose
         :param deterministic: choose the most probable ones
+        :param generator: to choose with, of the policy's device; None for torch's own
         :return: see :class:`Streams`; with ``actions``, ``expected_values`` is not computed and
             equals ``values``
         """
@@ -280,35 +281,36 @@ class TeamPolicy(ActorCriticPolicy):
         return prepared
 
     def _encode(
-        self, owner: str, keys: Sequence[str], obs: Observation, memo: dict[Any, Any]
-    ) -> TeamFeatures:
+        self, owner: str, keys: Sequence[str], obs: Observation, memo: dict[Any, th.Tensor]
+    ) -> th.Tensor:
         """Read some keys.
 
-        :param memo: what was read in this forward pass: shared encoders run once
-        :return: n rows
+        :param memo: what was read in this forward pass, so that shared encoders run once
+        :return: float32 (n, size)
         """
-        keys = self._own_first(keys)
         names = tuple(self._encoder_name(owner, key) if self._is_map(key) else key for key in keys)
         if names not in memo:
+            rows = obs[AGENT_KEY].shape[0]
             parts = []
             for key, name in zip(keys, names, strict=True):
                 if name not in memo:
-                    memo[name] = (
-                        self.encoders[name](self._scaled(key, obs[key]))
-                        if self._is_map(key)
-                        else as_vectors(self.observation_space[key], obs[key])
-                    )
-                parts.append(memo[name])
-            memo[names] = TeamFeatures(obs[AGENT_KEY].shape[0], parts)
-        features: TeamFeatures = memo[names]
-        return features
+                    memo[name] = self._read(key, name, obs[key])
+                part = memo[name]
+                if part.shape[0] != rows:
+                    part = part.repeat_interleave(rows // part.shape[0], dim=0)
+                parts.append(part)
+            memo[names] = th.cat(parts, dim=1)
+        return memo[names]
 
-    def _own_first(self, keys: Sequence[str]) -> list[str]:
-        """Order keys: large maps, which teams share, come last, see ``TeamFeatures``."""
-        shapes = {key: self.observation_space[key].shape or () for key in keys}
-        return sorted(
-            keys, key=lambda key: self._is_map(key) and map_style(key, shapes[key]) != "local"
-        )
+    def _read(self, key: str, name: str, value: th.Tensor) -> th.Tensor:
+        """Read one key: a map by its encoder, in the policy's precision, anything else as it is."""
+        if not self._is_map(key):
+            return as_vectors(self.observation_space[key], value)
+        # Only here: elsewhere matrices are so small that casting costs what bfloat16 gains.
+        bf16 = resolve_precision(self.precision, value.device) == "bf16"
+        with th.autocast(value.device.type, th.bfloat16, enabled=bf16):
+            encoded: th.Tensor = self.encoders[name](self._scaled(key, value))
+        return encoded.float()
 
     def _is_map(self, key: str) -> bool:
         return len(self.observation_space[key].shape or ()) == 3
@@ -321,12 +323,6 @@ class TeamPolicy(ActorCriticPolicy):
         high = float(space.high.max())
         scale = maps.dtype == th.uint8 and space.dtype == np.uint8 and high > 1.0
         return maps / high if scale else maps
-
-    def _uses_bf16(self) -> bool:
-        return resolve_precision(self.precision, self.device) == "bf16"
-
-    def _autocast(self) -> th.autocast:
-        return th.autocast(self.device.type, th.bfloat16, enabled=self._uses_bf16())
 
     def _count_goals(self, goal_key: str | None, n_moves: int) -> int:
         """Check a key whose rows begin with flags of the moves towards sub-goals.

@@ -10,7 +10,6 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_roles.common.names import closest
-from sb3_roles.common.team_features import TeamFeatures, apply_linear
 
 NORM_LAYERS = ("none", "frozen_batch", "group")
 PRECISIONS = ("auto", "fp32", "bf16")
@@ -185,7 +184,7 @@ class PatchEncoder(nn.Module):
         grid = self.grid
         patches = maps.unflatten(1, (grid, grid)) if maps.ndim == 3 else self.cut(maps)
         # Rearranged as bytes, and only then widened.
-        embedded = F.relu(self.embed(patches.to(_compute_dtype(maps))))
+        embedded = F.relu(self.embed(patches.to(_compute_dtype(maps))), inplace=True)
         if embedded.shape[1:3] != (grid, grid):
             pooled = F.adaptive_avg_pool2d(embedded.permute(0, 3, 1, 2), grid)
             embedded = pooled.permute(0, 2, 3, 1)
@@ -245,26 +244,7 @@ def symlog(x: th.Tensor) -> th.Tensor:
     return x.sign() * x.abs().log1p()
 
 
-class MLP(nn.Sequential):
-    """Layers in sequence; the first one may read :class:`TeamFeatures`."""
-
-    def forward(self, x: th.Tensor | TeamFeatures) -> th.Tensor:
-        """Map (n, in_features) to (n, width)."""
-        layers = list(self)
-        if isinstance(x, TeamFeatures):
-            if not layers:
-                return x.rows()
-            first = layers.pop(0)
-            assert isinstance(first, nn.Linear)
-            rows = x.linear(first)
-        else:
-            rows = x
-        for layer in layers:
-            rows = layer(rows)
-        return rows
-
-
-def mlp(in_features: int, widths: Sequence[int]) -> MLP:
+def mlp(in_features: int, widths: Sequence[int]) -> nn.Sequential:
     """Linear layers, each with a ReLU behind it.
 
     :param in_features: size of the input
@@ -274,7 +254,7 @@ def mlp(in_features: int, widths: Sequence[int]) -> MLP:
     for width in widths:
         layers += [nn.Linear(in_features, width), nn.ReLU(inplace=True)]
         in_features = width
-    return MLP(*layers)
+    return nn.Sequential(*layers)
 
 
 class Head(nn.Module):
@@ -294,7 +274,7 @@ class Head(nn.Module):
         self.out = nn.Linear(widths[-1] if widths else in_features, out_features)
         self.gain = gain
 
-    def forward(self, x: th.Tensor | TeamFeatures) -> th.Tensor:
+    def forward(self, x: th.Tensor) -> th.Tensor:
         """Map (n, in_features) to (n, out_features)."""
         return self.out(self.hidden(x))
 
@@ -327,23 +307,19 @@ class RoleHead(nn.Module):
         self.role = nn.Linear(n_roles, widths[0], bias=False)
         self.head = Head(widths[0], widths[1:], out_features, gain)
 
-    def forward(self, x: th.Tensor | TeamFeatures, roles: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, x: th.Tensor, roles: th.Tensor | None = None) -> th.Tensor:
         """Evaluate for one role per row, or for all of them.
 
         :param x: float (n, in_features)
         :param roles: int64 (n,); None for all roles
         :return: float (n, out_features), or (n, n_roles, out_features)
         """
-        first = apply_linear(self.features, x)
+        first = self.features(x)
         if roles is None:
-            by_role = self.role.weight.t().to(first.dtype)
-            return self.head(F.relu(first.unsqueeze(1) + by_role))
-        # A product with one-hots: the backward pass of indexing is ten times slower. In float32: so
-        # few columns are slower to multiply as bfloat16.
-        one_hot = F.one_hot(roles, self.role.in_features).to(self.role.weight.dtype)
-        with th.autocast(one_hot.device.type, enabled=False):
-            by_role = self.role(one_hot)
-        return self.head(F.relu(first + by_role.to(first.dtype)))
+            return self.head(F.relu(first.unsqueeze(1) + self.role.weight.t()))
+        # A product with one-hots: the backward pass of indexing is ten times slower.
+        one_hot = F.one_hot(roles, self.role.in_features).to(first.dtype)
+        return self.head(F.relu(first + self.role(one_hot)))
 
 
 class GoalPrior(nn.Module):
@@ -392,9 +368,7 @@ class GraphLayer(nn.Module):
         :param graph: float (n_teams, n_agents, n_agents), S
         :return: float (n_teams, n_agents, out_features)
         """
-        # In float32: products of many small matrices are slower as bfloat16.
-        with th.autocast(x.device.type, enabled=False):
-            messages = th.bmm(graph, x.to(graph.dtype)).to(x.dtype)
+        messages = th.bmm(graph, x)
         return F.relu(self.own(x) + self.others(messages))
 
 

@@ -19,7 +19,6 @@ from sb3_roles.common.distributions import (
 from sb3_roles.common.names import closest
 from sb3_roles.common.policies import Observation, Streams, TeamPolicy
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, STREAMS
-from sb3_roles.common.team_features import TeamFeatures
 from sb3_roles.common.torch_layers import GoalPrior, GraphLayer, Head, RoleHead, mlp
 
 PRIMITIVE_INPUTS = ("own", "graph")
@@ -160,67 +159,67 @@ class RoleActorCriticPolicy(TeamPolicy):
         return GoalPrior(weights, self.n_moves)
 
     def _move_log_probs(
-        self, own: TeamFeatures, roles: th.Tensor | None, obs: Observation
+        self, own: th.Tensor, roles: th.Tensor | None, obs: Observation
     ) -> th.Tensor:
         """Return log p(move | role), (n, n_moves) for given roles or (n, n_roles, n_moves)."""
-        logits = self.action_net(own, roles).float()
+        logits = self.action_net(own, roles)
         if self.goal_net is not None:
             logits = logits + self.goal_net(obs[self.goal_key], roles)  # type: ignore[index]
         return F.log_softmax(logits, dim=-1)
 
-    def _with_role(self, features: TeamFeatures, obs: Observation) -> TeamFeatures:
-        return features.joined(obs[ROLE_KEY]) if self.see_role else features
+    def _with_role(self, features: th.Tensor, obs: Observation) -> th.Tensor:
+        return th.cat([features, obs[ROLE_KEY]], dim=1) if self.see_role else features
 
     def _actor_features(
-        self, obs: Observation, memo: dict[Any, Any]
-    ) -> tuple[th.Tensor, TeamFeatures]:
+        self, obs: Observation, memo: dict[Any, th.Tensor]
+    ) -> tuple[th.Tensor, th.Tensor]:
         """Return the roles' log-probabilities (n, n_roles) and the primitive actor's input."""
         n_agents = self.team_size(obs)
-        seen = self._with_role(self._encode("role", self.actor_keys, obs, memo), obs)
-        features = self.role_mlp(seen)
+        features = self._with_role(self._encode("role", self.actor_keys, obs, memo), obs)
+        features = self.role_mlp(features)
         if self.graph:
             graph = self._graph(obs, features, n_agents)
             teams = features.view(-1, n_agents, features.shape[1])
             features = self.role_graph(teams, graph).flatten(0, 1)
-        logits = self.role_net(features).float()
+        logits = self.role_net(features)
         role_log_probs = role_log_probabilities(
             logits, obs[ROLE_KEY], obs[ROLE_DUE_KEY][:, 0] > 0.5
         )
         own = self._encode("primitive", self._move_keys, obs, memo)
         if self.primitive_input == "graph":
-            own = own.joined(features)
+            own = th.cat([own, features], dim=1)
         return role_log_probs, own
 
-    def _role_values(self, obs: Observation, memo: dict[Any, Any]) -> th.Tensor:
+    def _role_values(self, obs: Observation, memo: dict[Any, th.Tensor]) -> th.Tensor:
         features = self._encode("value_role", self.critic_keys, obs, memo)
-        return self.role_value_net(self._with_role(features, obs)).float()
+        return self.role_value_net(self._with_role(features, obs))
 
     def streams(
         self,
         obs: Observation,
         actions: th.Tensor | None = None,
         deterministic: bool = False,
+        generator: th.Generator | None = None,
     ) -> Streams:
         """Evaluate both actors and both critics, see :meth:`TeamPolicy.streams`.
 
         The primitive value to bootstrap with is the expectation over roles: the role of the next
         step is not chosen yet.
         """
-        memo: dict[Any, Any] = {}
+        memo: dict[Any, th.Tensor] = {}
         choose = actions is None
-        with self._autocast():
-            role_log_probs, own = self._actor_features(obs, memo)
-            if actions is None:
-                roles = role_log_probs.argmax(1) if deterministic else sample_index(role_log_probs)
-            else:
-                roles = actions[:, 0]
-            move_log_probs = self._move_log_probs(own, roles, obs)
-            role_values = self._role_values(obs, memo)
-            critic = self._encode("value_primitive", self.critic_keys, obs, memo)
-            move_values = self.value_net(critic, None if choose else roles).float()
+
+        def chosen(log_probs: th.Tensor) -> th.Tensor:
+            return log_probs.argmax(1) if deterministic else sample_index(log_probs, generator)
+
+        role_log_probs, own = self._actor_features(obs, memo)
+        roles = chosen(role_log_probs) if actions is None else actions[:, 0]
+        move_log_probs = self._move_log_probs(own, roles, obs)
+        role_values = self._role_values(obs, memo)
+        critic = self._encode("value_primitive", self.critic_keys, obs, memo)
+        move_values = self.value_net(critic, None if choose else roles)
         if actions is None:
-            moves = move_log_probs.argmax(1) if deterministic else sample_index(move_log_probs)
-            actions = th.stack([roles, moves], dim=1)
+            actions = th.stack([roles, chosen(move_log_probs)], dim=1)
         expected = move_values
         if choose:
             by_role = move_values.squeeze(2)
@@ -238,12 +237,10 @@ class RoleActorCriticPolicy(TeamPolicy):
 
     def get_distribution(self, obs: th.Tensor | Observation) -> RoleDistribution:
         """Return the joint distribution over role and move of whole teams."""
-        with self._autocast():
-            role_log_probs, own = self._actor_features(obs, {})  # type: ignore[arg-type]
-            move_log_probs = self._move_log_probs(own, None, obs)  # type: ignore[arg-type]
+        role_log_probs, own = self._actor_features(obs, {})  # type: ignore[arg-type]
+        move_log_probs = self._move_log_probs(own, None, obs)  # type: ignore[arg-type]
         return RoleDistribution().proba_distribution(role_log_probs, move_log_probs)
 
     def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:
         """Return the role values of any rows, float (n, 1)."""
-        with self._autocast():
-            return self._role_values(obs, {})  # type: ignore[arg-type]
+        return self._role_values(obs, {})  # type: ignore[arg-type]

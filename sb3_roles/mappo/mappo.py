@@ -12,15 +12,27 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
 from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
 from sb3_roles.common.policies import TeamPolicy
-from sb3_roles.common.shards import Gradients, Shards, add_gradients
+from sb3_roles.common.rollouts import (
+    Acted,
+    TeamGroup,
+    act,
+    expected_values,
+    join,
+    make_groups,
+    split_teams,
+    take_teams,
+    truncation_values,
+)
+from sb3_roles.common.shards import Gradients, add_gradients, shards_of
 from sb3_roles.common.team_wrapper import AGENT_KEY, TeamWrapper, find_team_env
+from sb3_roles.common.threads import ThreadCrew
 from sb3_roles.common.torch_layers import updating_statistics
 from sb3_roles.mappo.policies import TeamActorCriticPolicy
 
@@ -61,6 +73,9 @@ class MAPPO(OnPolicyAlgorithm):
     :param max_grad_norm: gradients are clipped to this norm; None does not clip
     :param n_shards: parts of a minibatch whose gradients are computed side by side, each on threads
         of its own, and added; their number moves results by rounding
+    :param rollout_groups: groups of teams that the policy acts for side by side, each on a thread
+        and with random numbers of its own; with more than one, rollouts do not depend on the number
+        of threads
     :param target_kl: stop the epochs of an update when a minibatch diverges by more than 1.5 times
         this; None never
     :param policy_kwargs: arguments of the policy
@@ -95,6 +110,7 @@ class MAPPO(OnPolicyAlgorithm):
         kl_target: float = 0.01,
         max_grad_norm: float | None = 0.5,
         n_shards: int = 1,
+        rollout_groups: int = 1,
         target_kl: float | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
@@ -134,9 +150,11 @@ class MAPPO(OnPolicyAlgorithm):
         self.kl_coef = kl_coef
         self.kl_target = kl_target
         self.n_shards = n_shards
+        self.rollout_groups = rollout_groups
         self.target_kl = target_kl
         self.kl_coefs: list[float] = []
-        check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs, n_shards=n_shards)
+        check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs)
+        check_positive(n_shards=n_shards, rollout_groups=rollout_groups)
         check_unit(gamma=gamma, gae_lambda=gae_lambda)
         check_not_negative(vf_coef=vf_coef, kl_coef=kl_coef, kl_target=kl_target)
         for name, value in (("max_grad_norm", max_grad_norm), ("target_kl", target_kl)):
@@ -167,6 +185,8 @@ class MAPPO(OnPolicyAlgorithm):
         return env if wrapped else cls.wrapper_class(env)
 
     def _setup_model(self) -> None:
+        if self.env is not None:
+            split_teams(find_team_env(self.env).n_teams, self.rollout_groups)
         super()._setup_model()
         self.clip_schedule = FloatSchedule(self.clip_range)
         self.ent_schedule = FloatSchedule(self.ent_coef)
@@ -212,29 +232,29 @@ class MAPPO(OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
         callback.on_rollout_start()
-        for _ in range(n_rollout_steps):
-            obs = self.policy.prepare(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
-            with th.inference_mode():
-                chosen = self.policy.streams(obs)
-            actions = chosen.actions.cpu().numpy()
-            new_obs, rewards, dones, infos = env.step(self._to_env(actions))
-            self.num_timesteps += env.num_envs
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-            self._update_info_buffer(infos, dones)
-            # A copy: the values at truncations are added to it.
-            stream_rewards = th.tensor(self._stream_rewards(env, rewards), device=self.device)
-            self._bootstrap(stream_rewards, dones, infos)
-            ends = th.as_tensor(dones).to(self.device)
-            rollout_buffer.add_streams(obs, chosen, stream_rewards, ends)
-            self._last_obs = new_obs  # type: ignore[assignment]
-            self._last_episode_starts = dones
-        with th.inference_mode():
-            last = self.policy.streams(obs_as_tensor(self._last_obs, self.device))  # type: ignore[arg-type]
+        team_env = find_team_env(env)
+        groups = make_groups(team_env.n_teams, team_env.n_agents, self.rollout_groups, self.device)
+        with ThreadCrew(len(groups), self.device, 1 if len(groups) > 1 else None) as crew:
+            for _ in range(n_rollout_steps):
+                obs, chosen = self._act(crew, groups)
+                actions = chosen.actions.cpu().numpy()
+                new_obs, rewards, dones, infos = env.step(self._to_env(actions))
+                self.num_timesteps += env.num_envs
+                callback.update_locals(locals())
+                if not callback.on_step():
+                    return False
+                self._update_info_buffer(infos, dones)
+                # A copy: the values at truncations are added to it.
+                stream_rewards = th.tensor(self._stream_rewards(env, rewards), device=self.device)
+                self._bootstrap(crew, groups, stream_rewards, dones, infos)
+                ends = th.as_tensor(dones).to(self.device)
+                rollout_buffer.add_streams(obs, chosen, stream_rewards, ends)
+                self._last_obs = new_obs  # type: ignore[assignment]
+                self._last_episode_starts = dones
+            last_values = self._last_values(crew, groups)
         settings = self._settings()
         rollout_buffer.compute_stream_returns(
-            last.expected_values,
+            last_values,
             th.tensor([s.gamma for s in settings], device=self.device),
             th.tensor([s.gae_lambda for s in settings], device=self.device),
             self.normalize_advantage,
@@ -243,22 +263,56 @@ class MAPPO(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
+    def _seen_by(self, group: TeamGroup, n_groups: int) -> dict[str, np.ndarray]:
+        """Return the last observations of a group."""
+        last_obs: Any = self._last_obs
+        if n_groups == 1:
+            return last_obs
+        return take_teams(last_obs, group.teams, find_team_env(self.env).n_teams)
+
+    def _act(self, crew: ThreadCrew, groups: list[TeamGroup]) -> Acted:
+        """Choose the actions of all teams."""
+
+        def of_group(group: TeamGroup) -> Acted:
+            return act(self.policy, self._seen_by(group, len(groups)), group.generator)
+
+        return join(crew.map(of_group, groups))
+
+    def _last_values(self, crew: ThreadCrew, groups: list[TeamGroup]) -> th.Tensor:
+        """Return the values after the last step of all teams, float (n, S)."""
+
+        def of_group(group: TeamGroup) -> th.Tensor:
+            return expected_values(self.policy, self._seen_by(group, len(groups)))
+
+        return th.cat(crew.map(of_group, groups))
+
     def _bootstrap(
-        self, stream_rewards: th.Tensor, dones: np.ndarray, infos: list[dict[str, Any]]
+        self,
+        crew: ThreadCrew,
+        groups: list[TeamGroup],
+        stream_rewards: th.Tensor,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
     ) -> None:
         """Add the value of the last observation to the last reward of truncated episodes."""
-        truncated = np.array([bool(info.get("TimeLimit.truncated")) for info in infos])
-        if not truncated.any():
+        if not dones.any():
             return
-        # Whole teams, which end together, even if only some of their robots were truncated.
-        rows = np.flatnonzero(dones)
-        last = [infos[row]["terminal_observation"] for row in rows]
-        stacked = {key: np.stack([one[key] for one in last]) for key in last[0]}
-        with th.inference_mode():
-            values = self.policy.streams(obs_as_tensor(stacked, self.device)).expected_values  # type: ignore[arg-type]
         gamma = th.tensor([s.gamma for s in self._settings()], device=self.device)
-        counts = th.as_tensor(truncated[rows], device=self.device).unsqueeze(1)
-        stream_rewards[th.as_tensor(rows, device=self.device)] += gamma * values * counts
+        found = crew.map(lambda one: truncation_values(self.policy, one.rows, dones, infos), groups)
+        for part in found:
+            if part is not None:
+                rows = th.as_tensor(part.rows, device=self.device)
+                counts = th.as_tensor(part.truncated, device=self.device).unsqueeze(1)
+                stream_rewards[rows] += gamma * part.values * counts
+
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
+        # SB3's loop, over the few rows that have anything to say.
+        rows = [row for row, info in enumerate(infos) if info]
+        if rows:
+            ended = None if dones is None else dones[rows]
+            super()._update_info_buffer([infos[row] for row in rows], ended)
 
     def train(self) -> None:
         """Update the policy on the rollout."""
@@ -268,14 +322,13 @@ class MAPPO(OnPolicyAlgorithm):
         history: list[list[StreamLoss]] = [[] for _ in settings]
         n_steps = 0
         stopped = False
-        with Shards(self.n_shards, self.device) as shards:
+        with ThreadCrew(self.n_shards, self.device) as crew:
             for _ in range(self.n_epochs):
                 for index in self.rollout_buffer.pairs(self.batch_size):
-                    losses, gradients = self._differentiate(index, settings, shards)
+                    losses, gradients = self._differentiate(index, settings, crew)
                     for records, loss in zip(history, losses, strict=True):
                         records.append(loss)
-                    kl = sum(float(loss.kl) for loss in losses)
-                    if self.target_kl is not None and kl > 1.5 * self.target_kl:
+                    if self._too_far(losses):
                         stopped = True
                         break
                     # L = L_p + L_r (Eq. 9)
@@ -291,8 +344,14 @@ class MAPPO(OnPolicyAlgorithm):
                 kl = float(th.stack([record.kl for record in records]).mean())
                 self.kl_coefs[s] = adapt_kl_coef(self.kl_coefs[s], kl, self.kl_target)
 
+    def _too_far(self, losses: list[StreamLoss]) -> bool:
+        """Whether to stop the epochs; without a limit, a GPU is not waited for."""
+        if self.target_kl is None:
+            return False
+        return sum(float(loss.kl) for loss in losses) > 1.5 * self.target_kl
+
     def _differentiate(
-        self, index: th.Tensor, settings: list[StreamSettings], shards: Shards
+        self, index: th.Tensor, settings: list[StreamSettings], crew: ThreadCrew
     ) -> tuple[list[StreamLoss], list[th.Tensor | None]]:
         """Compute the loss of a minibatch and its gradients, shard by shard.
 
@@ -328,7 +387,7 @@ class MAPPO(OnPolicyAlgorithm):
             gradients = th.autograd.grad(total, parameters, allow_unused=True)
             return [StreamLoss(*(term.detach() for term in part)) for part in losses], gradients
 
-        parts = shards.map(of_shard, index)
+        parts = crew.map(of_shard, shards_of(index, self.n_shards))
         losses = [
             StreamLoss(*(th.stack(terms).sum() for terms in zip(*of_stream, strict=True)))
             for of_stream in zip(*(losses for losses, _ in parts), strict=True)

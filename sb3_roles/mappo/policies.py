@@ -82,45 +82,43 @@ class TeamActorCriticPolicy(TeamPolicy):
         self.value_net = Head(size, self.value_arch, 1, gain=1.0)  # type: ignore[assignment]
         self.action_dist = CategoricalDistribution(n_moves)
 
-    def _log_probs(self, obs: Observation, memo: dict[Any, Any]) -> th.Tensor:
+    def _log_probs(self, obs: Observation, memo: dict[Any, th.Tensor]) -> th.Tensor:
         n_agents = self.team_size(obs)
         features = self.actor_mlp(self._encode("primitive", self.actor_keys, obs, memo))
         if self.graph:
             graph = self._graph(obs, features, n_agents)
             teams = features.view(-1, n_agents, features.shape[1])
             features = self.actor_graph(teams, graph).flatten(0, 1)
-        logits = self.action_net(features).float()
+        logits = self.action_net(features)
         if self.goal_net is not None:
             logits = logits + self.goal_net(obs[self.goal_key])  # type: ignore[index]
         return F.log_softmax(logits, dim=1)
 
-    def _values(self, obs: Observation, memo: dict[Any, Any]) -> th.Tensor:
-        return self.value_net(self._encode("value_primitive", self.critic_keys, obs, memo)).float()
+    def _values(self, obs: Observation, memo: dict[Any, th.Tensor]) -> th.Tensor:
+        return self.value_net(self._encode("value_primitive", self.critic_keys, obs, memo))
 
     def streams(
         self,
         obs: Observation,
         actions: th.Tensor | None = None,
         deterministic: bool = False,
+        generator: th.Generator | None = None,
     ) -> Streams:
         """Evaluate the actor and the critic, see :meth:`TeamPolicy.streams`."""
-        memo: dict[Any, Any] = {}
-        with self._autocast():
-            log_probs = self._log_probs(obs, memo)
-            values = self._values(obs, memo)
+        memo: dict[Any, th.Tensor] = {}
+        log_probs = self._log_probs(obs, memo)
+        values = self._values(obs, memo)
         if actions is None:
-            chosen = log_probs.argmax(1) if deterministic else sample_index(log_probs)
+            chosen = log_probs.argmax(1) if deterministic else sample_index(log_probs, generator)
             actions = chosen.unsqueeze(1)
         active = th.ones_like(actions, dtype=th.bool)
         return Streams(actions, (log_probs,), values, values, active)
 
     def get_distribution(self, obs: th.Tensor | Observation) -> CategoricalDistribution:
         """Return the distribution over moves of whole teams."""
-        with self._autocast():
-            log_probs = self._log_probs(obs, {})  # type: ignore[arg-type]
+        log_probs = self._log_probs(obs, {})  # type: ignore[arg-type]
         return CategoricalDistribution(log_probs.shape[1]).proba_distribution(log_probs)
 
     def predict_values(self, obs: th.Tensor | Observation) -> th.Tensor:
         """Return the values of any rows, float (n, 1)."""
-        with self._autocast():
-            return self._values(obs, {})  # type: ignore[arg-type]
+        return self._values(obs, {})  # type: ignore[arg-type]

@@ -127,6 +127,7 @@ _MAPPO: dict[str, Range] = {
     "batch_size": Whole(1, 1e9),
     "n_epochs": Whole(1, 1000),
     "n_shards": Whole(1, 1024),
+    "rollout_groups": Whole(1, 1024),
     "clip_range": _CLIP,
     "normalize_advantage": Flag(),
     "ent_coef": Number(0.0, 1e6, schedule=True),

@@ -17,6 +17,7 @@ from sb3_roles.zoo.bench_memory import rollout_memory
 from sb3_roles.zoo.bench_report import against, spread
 from sb3_roles.zoo.config import load_settings, merge, resolve
 from sb3_roles.zoo.environments import AREA_SEARCH
+from sb3_roles.zoo.launcher import prepare_process, process_settings
 from sb3_roles.zoo.machine import describe_machine
 
 TUNED = "hmappo native"
@@ -42,8 +43,7 @@ def start_torch(num_threads: int | None) -> dict[str, Any]:
     :return: see ``zoo.machine.describe_machine``; also torch, and the settings of its threads
     """
     machine = describe_machine()
-    # Read when torch is imported, as in train.py.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    prepare_process()
     import stable_baselines3
     import torch as th
 
@@ -58,6 +58,7 @@ def start_torch(num_threads: int | None) -> dict[str, Any]:
         "torch_threads": th.get_num_threads(),
         "cpu_capability": th.backends.cpu.get_cpu_capability(),
         "fast_bfloat16": has_fast_bfloat16(),
+        "process": process_settings(),
         "environment": {name: os.environ[name] for name in _VARIABLES if name in os.environ},
     }
 
@@ -140,9 +141,12 @@ class TrainingCase:
         policy, buffer = self.model.policy, self.model.rollout_buffer
         self.watch.watch("update", self.model, "train")
         self.watch.watch("environment", self.model.env, "step")
-        for method in ("streams", "forward"):
-            if hasattr(policy, method):
-                self.watch.watch("inference", policy, method)
+        if hasattr(self.model, "rollout_groups"):
+            # The policy itself runs on other threads.
+            for method in ("_act", "_bootstrap", "_last_values"):
+                self.watch.watch("inference", self.model, method)
+        else:
+            self.watch.watch("inference", policy, "forward")
         for method in ("add_streams", "add", "compute_stream_returns",
                        "compute_returns_and_advantage"):  # fmt: skip
             if hasattr(buffer, method):
@@ -184,15 +188,14 @@ class TrainingCase:
         import torch as th
 
         threads = th.get_num_threads()
-        if num_threads is not None:
-            th.set_num_threads(num_threads)
+        self._set_threads(num_threads or threads)
         updates = self.watch.seconds["update"]
         cpu, start = time.process_time(), time.perf_counter()
         try:
             self._train(iterations)
         finally:
             seconds = time.perf_counter() - start
-            th.set_num_threads(threads)
+            self._set_threads(threads)
         done = iterations * self.model.n_steps * self.n_teams
         updates = self.watch.seconds["update"] - updates
         self.rates.append(done / seconds)
@@ -202,6 +205,14 @@ class TrainingCase:
         self.work.joint_steps += done
         self.work.robot_steps += done * self.n_agents
         self.seconds += seconds
+
+    def _set_threads(self, number: int) -> None:
+        import torch as th
+
+        th.set_num_threads(number)
+        # As make_env does.
+        if self.env.has_attr("n_threads"):
+            self.env.set_attr("n_threads", number)
 
     def repeat_update(self) -> tuple[float, Work]:
         """Update once more on the last rollout, apart from all that :meth:`describe` returns.
@@ -265,14 +276,16 @@ def configure(
     :param backend: of ``make_team_vec_env``
     :param changes: see ``zoo.config.merge``
     :param n_envs: teams; None for those of the configuration. Of too few for a minibatch, the
-        whole rollout is one
+        whole rollout is one, and groups of teams are as many as teams at most
     :raises ConfigError: if they do not fit
     """
     settings = merge(load_settings(algo, AREA_SEARCH), changes or {})
     if n_envs is not None:
         settings["n_envs"] = n_envs
-        if "batch_size" in settings:
-            settings["batch_size"] = min(settings["batch_size"], n_envs * settings["n_steps"])
+        limits = {"batch_size": n_envs * settings["n_steps"], "rollout_groups": n_envs}
+        for key, limit in limits.items():
+            if key in settings:
+                settings[key] = min(settings[key], limit)
     return resolve(algo, AREA_SEARCH, settings, 0, backend)
 
 

@@ -20,7 +20,7 @@ from sb3_roles.common.losses import stream_loss
 from sb3_roles.common.policies import POSITION_KEY
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY
 from sb3_roles.common.team_wrapper import AGENT_KEY
-from sb3_roles.common.torch_layers import PatchEncoder, map_style, symlog
+from sb3_roles.common.torch_layers import PatchEncoder, symlog
 from sb3_roles.hmappo import HMAPPO
 from sb3_roles.hmappo.policies import RoleActorCriticPolicy
 from sb3_roles.zoo.bench_case import Work
@@ -84,12 +84,9 @@ class LiteralPolicy:
     ) -> th.Tensor:
         """Encode what a network reads; ``seen`` keeps what encoders that are shared have read."""
         spaces = self.policy.observation_space
-        shapes = {key: spaces[key].shape or () for key in keys}
-        maps = {key for key in keys if len(shapes[key]) == 3}
-        ordered = sorted(keys, key=lambda k: k in maps and map_style(k, shapes[k]) != "local")
         parts = []
-        for key in ordered:
-            if key not in maps:
+        for key in keys:
+            if len(spaces[key].shape or ()) != 3:
                 values = rows[key].flatten(1)
                 bounded = bool(np.isfinite(spaces[key].high).all())  # type: ignore[attr-defined]
                 parts.append(values if bounded else symlog(values))
@@ -132,7 +129,7 @@ class LiteralPolicy:
         roles = actions[:, 0]
         view = self._features("role", policy.actor_keys, rows, seen)
         if policy.see_role:
-            view = th.cat([rows[ROLE_KEY], view], dim=1)
+            view = th.cat([view, rows[ROLE_KEY]], dim=1)
         x = self._mlp("role_mlp", view)
         if policy.graph:
             x = self._messages(x, rows)
@@ -143,7 +140,7 @@ class LiteralPolicy:
 
         own = self._features("primitive", policy._move_keys, rows, seen)
         if policy.primitive_input == "graph":
-            own = th.cat([x, own], dim=1)
+            own = th.cat([own, x], dim=1)
         logits = self._role_head("action_net", own, roles)
         if policy.goal_key is not None:
             flags = rows[policy.goal_key][..., : policy.n_moves]
@@ -151,7 +148,7 @@ class LiteralPolicy:
             logits = logits + (weight.unsqueeze(2) * flags).sum(1)
 
         state = self._features("value_role", policy.critic_keys, rows, seen)
-        with_role = th.cat([rows[ROLE_KEY], state], dim=1) if policy.see_role else state
+        with_role = th.cat([state, rows[ROLE_KEY]], dim=1) if policy.see_role else state
         role_values = self._head("role_value_net", with_role).squeeze(1)
         state = self._features("value_primitive", policy.critic_keys, rows, seen)
         move_values = self._role_head("value_net", state, roles).squeeze(1)

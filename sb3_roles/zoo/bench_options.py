@@ -55,8 +55,10 @@ CHANGES: dict[str, Change] = {
     ),
     "share_encoders false": Change(_policy(share_encoders=False)),
     "n_shards 1": Change({"n_shards": 1}),
+    "rollout_groups 1": Change({"rollout_groups": 1}),
+    "n_epochs 1": Change({"n_epochs": 1}),
     "n_epochs 2": Change({"n_epochs": 2}),
-    "n_epochs 8": Change({"n_epochs": 8}),
+    "n_epochs 4": Change({"n_epochs": 4}),
     "num_threads 1": Change(num_threads=1),
 }
 

@@ -139,8 +139,8 @@ def machine_lines(machine: dict[str, Any]) -> list[str]:
         ", ".join(versions),
     ]
     if "torch_threads" in machine:
-        given = [f"{name}={value}" for name, value in machine["environment"].items()]
-        lines.append(", ".join([plural(machine["torch_threads"], "thread") + " of torch", *given]))
+        threads = plural(machine["torch_threads"], "thread") + " of torch"
+        lines.append(f"{threads}, {machine['process']}")
     return lines
 
 

@@ -108,6 +108,8 @@ def stock_case(name: str, config: Mapping[str, Any], backend: str) -> TrainingCa
     factory = env_factory(config["env"], config["env_kwargs"])
     # As SB3 takes it: what a team shares is repeated for each robot.
     venv = make_team_vec_env(factory, config["n_envs"], backend=backend)
+    if venv.has_attr("n_threads"):
+        venv.set_attr("n_threads", th.get_num_threads())
     env = RoleWrapper(venv, **config["wrapper_kwargs"])
     own = complete(config)["policy_kwargs"]
     arguments = ALGORITHMS["ppo"].arguments(config, env.n_agents)

@@ -130,6 +130,11 @@ def _together(config: Mapping[str, Any]) -> list[str]:
             f"batch_size must be at most n_steps x n_envs = {n_steps} x {config['n_envs']} = "
             f"{n_steps * config['n_envs']} joint steps, got {batch_size}"
         )
+    groups = config.get("rollout_groups", 1)
+    if groups > config["n_envs"]:
+        found.append(
+            f"rollout_groups must be at most n_envs = {config['n_envs']} teams, got {groups}"
+        )
     if config["env"] != AREA_SEARCH:
         return found
     env_kwargs, policy_kwargs = config["env_kwargs"], config["policy_kwargs"]

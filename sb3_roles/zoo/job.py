@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 import warnings
@@ -32,6 +31,7 @@ from sb3_roles.evaluation.evaluators import SceneEvaluator, VecEnvEvaluator
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run
+from sb3_roles.zoo.launcher import process_settings
 from sb3_roles.zoo.models import check_device, complete, make_env, make_model, steps_of
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.run_folder import (
@@ -304,8 +304,7 @@ def _print_start(
         f"{team_env.n_teams} teams of {team_env.n_agents} ({type(team_env).__name__}), joint steps "
         f"{resumed_at or 0} to {config['n_timesteps']} in whole rollouts of "
         f"{model.n_steps * team_env.n_teams}, seed {config['seed']}, "
-        f"{model.device.type}, {th.get_num_threads()} threads, "
-        f"OMP_WAIT_POLICY={os.environ.get('OMP_WAIT_POLICY')}\n"
+        f"{model.device.type}, {th.get_num_threads()} threads, {process_settings()}\n"
         f"run folder {run}, {time.strftime('%Y-%m-%d %H:%M:%S')}",
         flush=True,
     )

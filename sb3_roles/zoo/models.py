@@ -36,7 +36,8 @@ def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
 
     :param config: checked, see ``zoo.config``
     :param n_envs: teams; by default the configuration's
-    :return: rows are robots; not seeded, which the model does
+    :return: rows are robots; not seeded, which the model does; it steps on as many threads as torch
+        if it can
     :raises UsageError: if the environment does not fit
     """
     algorithm = get_algorithm(config["algo"])
@@ -48,6 +49,8 @@ def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
             backend=config["vec_env"],
             expand_team_observations=not algorithm.whole_teams,
         )
+        if venv.has_attr("n_threads"):
+            venv.set_attr("n_threads", th.get_num_threads())
         if algorithm.wrapper == "team":
             return TeamWrapper(venv)
         roles = RoleWrapper(venv, **config["wrapper_kwargs"])
@@ -180,9 +183,11 @@ def load_model(
     config = read_run_config(folder)
     check_named(folder, config["env"], env)
     small = {**config, "n_envs": 1}
+    # Of one team now; nothing is trained with it.
     if "batch_size" in config:
-        # Of one team now; nothing is trained with it.
         small["batch_size"] = config.get("n_steps", 1)
+    if "rollout_groups" in config:
+        small["rollout_groups"] = 1
     try:
         if best:
             checkpoint = read_checkpoint(folder / BEST / WEIGHTS_FILE)

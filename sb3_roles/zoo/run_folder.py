@@ -15,6 +15,7 @@ from typing import IO, Any
 from sb3_roles._version import __version__
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import folder_name
+from sb3_roles.zoo.launcher import process_settings
 from sb3_roles.zoo.options import UsageError
 
 ARGS_FILE, COMMAND_FILE, LOCK_FILE = "args.yml", "command.txt", "lock"
@@ -132,7 +133,7 @@ def write_description(
 
 
 def note_command(run: Path, command: Sequence[str]) -> None:
-    """Add a command line to ``command.txt``, with the commit and versions that it ran with.
+    """Add a command line to ``command.txt``, with the commit, versions and settings it ran with.
 
     The commit is null where the package is no file of a git work tree, as an installed one.
 
@@ -142,6 +143,7 @@ def note_command(run: Path, command: Sequence[str]) -> None:
     commit = source_commit(Path(__file__)) or "null"
     lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
     lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
+    lines.append(f"# {process_settings()}")
     with open(run / COMMAND_FILE, "a", encoding="utf-8") as file:
         file.write("\n".join(lines) + "\n")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +21,7 @@ from sb3_roles.zoo.config import (
 )
 from sb3_roles.zoo.config_checks import VEC_ENVS
 from sb3_roles.zoo.environments import AREA_SEARCH, check_named
+from sb3_roles.zoo.launcher import prepare_process
 from sb3_roles.zoo.options import (
     DEVICES,
     MAX_TRAINING_SEED,
@@ -200,8 +200,7 @@ def run(args: argparse.Namespace) -> int:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
         return EXIT_ERROR
-    # Read when torch is imported: threads that spin between operations steal time from numba.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    prepare_process()
     from sb3_roles.zoo.job import TrainingFailed, run_job
 
     try:
