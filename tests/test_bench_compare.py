@@ -134,8 +134,10 @@ def test_a_rival_with_more_epochs_is_refused(capsys, monkeypatch):
     assert stop.value.code == 2
     assert captured.out == ""
     assert captured.err.count("\n") == 1
-    # 100 joint steps of 4 robots: 5 epochs instead of 4.
-    assert "samples_times_epochs is 2,000 in 100 joint steps, and 1,600 in 100" in captured.err
+    config = configure(n_envs=2)
+    steps, epochs = 2 * config["n_steps"], config["n_epochs"]
+    assert f"samples_times_epochs is {4 * 5 * steps:,} in {steps} joint steps" in captured.err
+    assert f"and {4 * epochs * steps:,} in {steps} of the tuned default" in captured.err
 
 
 def test_stock_ppo_reads_the_state_with_its_critic_only():
@@ -160,7 +162,7 @@ def test_the_comparison_is_reported(capsys):
     assert main(["bench", "train", "--compare", *options]) == 0
     report = json.loads(capsys.readouterr().out)
     (tuned,) = report["cases"]
-    assert tuned["work"]["joint_steps"] == 2 * 2 * 100
+    assert tuned["work"]["joint_steps"] == 2 * 2 * 2 * configure()["n_steps"]
     found = {one["name"]: one for one in report["comparisons"]}
     assert list(found) == list(RIVALS)
     assert [one["measured"] for one in found.values()] == ["training", "training", "update"]

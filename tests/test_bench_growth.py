@@ -26,7 +26,7 @@ def test_growth_is_reported_and_drawn(capsys, tmp_path):
     assert sizes == [(2, 11), (3, 11), (2, 25), (2, 27)]
     for case in report["cases"]:
         assert case["n_teams"] == 2
-        assert case["work"]["joint_steps"] == 2 * 100
+        assert case["work"]["joint_steps"] == 2 * 2 * configure()["n_steps"]
         for cost in case["microseconds"].values():
             assert 0 < cost["min"] <= cost["median"] <= cost["max"]
         # What update and rollout cost is what a joint step costs.
@@ -65,12 +65,13 @@ def test_rollouts_that_do_not_fit_have_fewer_teams(monkeypatch):
         monkeypatch.setattr(bench_growth, "available_memory", lambda size=available: size)
         fitted = bench_growth._fitted(config, (4, 25), 2)
         assert fitted["n_envs"] == teams
-        assert fitted["batch_size"] == min(800, teams * 50)
+        assert fitted["batch_size"] == min(config["batch_size"], teams * config["n_steps"])
 
 
 def test_options_are_compared_with_what_differs_in_them_alone(capsys, monkeypatch):
-    names = ["norm_layer frozen_batch", "n_epochs 2", "num_threads 1", "the same"]
-    monkeypatch.setitem(bench_options.CHANGES, "the same", Change({"gamma": 0.95}))
+    names = ["norm_layer frozen_batch", "n_epochs 1", "num_threads 1", "the same"]
+    default = configure()
+    monkeypatch.setitem(bench_options.CHANGES, "the same", Change({"gamma": default["gamma"]}))
     options = ["--changes", ",".join(names), "--json"]
     assert main(["bench", "options", *SHORT, *options]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -78,14 +79,14 @@ def test_options_are_compared_with_what_differs_in_them_alone(capsys, monkeypatc
     assert against == {
         "encoder convolutions": "default",
         "norm_layer frozen_batch": "encoder convolutions",
-        "n_epochs 2": "default",
+        "n_epochs 1": "default",
         "num_threads 1": "default",
     }
     assert report["same_as_default"] == ["the same"]
     by_name = {one["change"]: one for one in report["changes"]}
     steps = report["default"]["work"]["optimizer_steps"]
-    assert steps == 2 * 4
-    assert by_name["n_epochs 2"]["work"]["optimizer_steps"] == steps // 2
+    assert steps == 2 * default["n_epochs"]
+    assert by_name["n_epochs 1"]["work"]["optimizer_steps"] == 2
     assert by_name["encoder convolutions"]["work"]["optimizer_steps"] == steps
     for one in report["changes"]:
         assert 0 < one["ratio"]["min"] <= one["ratio"]["median"] <= one["ratio"]["max"]

@@ -23,7 +23,8 @@ from sb3_roles.common.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
-from sb3_roles.common.snapshot import differences, env_gap, load_weights, machine_facts
+from sb3_roles.common.env_state import env_gap
+from sb3_roles.common.snapshot import differences, load_weights, machine_facts
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import resolve, write_yaml

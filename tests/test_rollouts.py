@@ -7,8 +7,9 @@ import torch as th
 from helpers import collect, same, small_search, weights
 
 from sb3_roles import HMAPPO, MAPPO
+from sb3_roles.common.env_state import take_rows
 from sb3_roles.common.policies import Streams
-from sb3_roles.common.rollouts import act, make_groups, split_teams, take_teams
+from sb3_roles.common.rollouts import act, make_groups, split_teams
 from sb3_roles.common.threads import ThreadCrew
 
 N_TEAMS = 5
@@ -73,14 +74,14 @@ def test_a_group_is_a_function_of_its_own_teams_and_generator(algorithm):
     _, callback = model._setup_learn(10**6, None)
     first = {key: value.copy() for key, value in model._last_obs.items()}
     th.set_rng_state(state)
-    groups = make_groups(N_TEAMS, 3, 3, CPU)
+    groups = make_groups(N_TEAMS, 3, 3)
     th.set_rng_state(state)
     assert model.collect_rollouts(model.env, callback, model.rollout_buffer, 1)
     buffer = model.rollout_buffer
     assert [group.teams for group in groups] == [slice(0, 2), slice(2, 4), slice(4, 5)]
     for group in groups:
-        seen = take_teams(first, group.teams, N_TEAMS)
-        chosen = act(model.policy, seen, group.generator).chosen
+        seen = take_rows(first, group.teams, N_TEAMS)
+        chosen = act(model.policy, seen, group.generator(CPU)).chosen
         assert isinstance(chosen, Streams)
         assert th.equal(buffer._actions[0, group.rows], chosen.actions)
         assert th.equal(buffer._values[0, group.rows], chosen.values)
@@ -91,15 +92,15 @@ def test_groups_differ_in_their_draws_and_rollouts_too():
     model = make(MAPPO, N_TEAMS)
     drawn = []
     for _ in range(2):
-        groups = make_groups(4, 3, 4, CPU)
-        drawn += [th.rand(8, generator=group.generator).tolist() for group in groups]
+        groups = make_groups(4, 3, 4)
+        drawn += [th.rand(8, generator=group.generator(CPU)).tolist() for group in groups]
     assert len({tuple(one) for one in drawn}) == 8
     th.manual_seed(0)
-    again = [th.rand(3, generator=one.generator) for one in make_groups(4, 3, 4, CPU)]
+    again = [th.rand(3, generator=one.generator(CPU)) for one in make_groups(4, 3, 4)]
     th.manual_seed(0)
     assert all(
-        th.equal(th.rand(3, generator=one.generator), draw)
-        for one, draw in zip(make_groups(4, 3, 4, CPU), again, strict=True)
+        th.equal(th.rand(3, generator=one.generator(CPU)), draw)
+        for one, draw in zip(make_groups(4, 3, 4), again, strict=True)
     )
     assert model.rollout_groups == N_TEAMS
 

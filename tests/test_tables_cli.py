@@ -605,7 +605,8 @@ def test_its_processes_end_with_it(how, tmp_path):
 
 def test_ray_is_asked_for_by_name(tell, plan, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "sb3_roles.evaluation.grid.ray_crew", raising=False)
+    for module in ("evaluation.grid.ray_crew", "common.ray_cluster"):
+        monkeypatch.delitem(sys.modules, f"sb3_roles.{module}", raising=False)
     code, _, err = tell("--plan", plan, "--ray", "local")
     assert code == 2
     assert err == ["sb3-roles tables: error: argument --ray: install sb3_roles[ray] to use it"]

@@ -86,6 +86,31 @@ WRONG = [
         "must be the environment's, 5, got 4",
     ),
     (["--env-kwargs", "reward_sharing:same_role"], "wrapper_kwargs.reward_sharing"),
+    (["-params", "rollout_groups:65"], "rollout_groups must be at most n_envs = 64 teams, got 65"),
+    (["--rollout-workers", "2"], "--rollout-workers needs --ray ADDRESS"),
+    (["--ray", "local"], "--ray needs --n-seeds K of at least 2"),
+    (["--ray", "local", "--n-seeds", "2", "--rollout-workers", "2"], "not both"),
+    (
+        ["--ray", "local", "--rollout-workers", "3"],
+        "--rollout-workers 3: the configuration's rollout_groups is 2",
+    ),
+    (
+        ["--algo", "ppo", "--ray", "local", "--rollout-workers", "1"],
+        "ppo plays its rollouts itself; allowed for hmappo, mappo, ecc, h2gnn",
+    ),
+    (
+        [
+            "--algo",
+            "mappo",
+            "--env",
+            "toy_envs:PlainEnv",
+            "--ray",
+            "local",
+            "--rollout-workers",
+            "1",
+        ],
+        "offers no get_state, with which its teams would travel",
+    ),
 ]
 
 

@@ -18,11 +18,15 @@ from sb3_roles.common.policies import Observation, Streams, TeamPolicy
 
 
 class TeamGroup(NamedTuple):
-    """Consecutive teams, and what they draw from in one rollout."""
+    """Consecutive teams, and what they draw with in one rollout."""
 
     teams: slice
     rows: slice
-    generator: th.Generator
+    seed: int
+
+    def generator(self, device: th.device) -> th.Generator:
+        """Return a fresh generator, the same at every call."""
+        return th.Generator(device).manual_seed(self.seed)
 
 
 class Acted(NamedTuple):
@@ -47,56 +51,22 @@ def split_teams(n_teams: int, n_groups: int) -> list[slice]:
     return [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
 
 
-def draw_seed() -> int:
-    """Draw the seed of a rollout from torch's own generator, which checkpoints keep."""
-    return int(th.randint(2**62, ()))
-
-
-def make_generator(seed: int, index: int, device: th.device) -> th.Generator:
-    """Make the generator of one group in one rollout.
-
-    :param seed: of the rollout, see :func:`draw_seed`
-    :param index: of the group
-    :param device: of the policy
-    """
-    word = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0]
-    return th.Generator(device).manual_seed(int(word >> np.uint64(1)))
-
-
-def make_groups(n_teams: int, n_agents: int, n_groups: int, device: th.device) -> list[TeamGroup]:
+def make_groups(n_teams: int, n_agents: int, n_groups: int) -> list[TeamGroup]:
     """Divide the teams of a rollout that begins, and seed the groups.
+
+    The seeds are drawn from torch's own generator, which checkpoints keep.
 
     :param n_teams: number of teams
     :param n_agents: robots in each
     :param n_groups: number of groups
-    :param device: of the policy
     :raises ValueError: see :func:`split_teams`
     """
-    seed = draw_seed()
+    drawn = int(th.randint(2**62, ()))
+    words = np.random.SeedSequence(drawn).generate_state(n_groups, np.uint64)
     return [
-        TeamGroup(
-            teams,
-            slice(teams.start * n_agents, teams.stop * n_agents),
-            make_generator(seed, index, device),
-        )
-        for index, teams in enumerate(split_teams(n_teams, n_groups))
+        TeamGroup(teams, slice(teams.start * n_agents, teams.stop * n_agents), int(word >> 1))
+        for teams, word in zip(split_teams(n_teams, n_groups), words.tolist(), strict=True)
     ]
-
-
-def take_teams(
-    observations: Mapping[str, np.ndarray], teams: slice, n_teams: int
-) -> dict[str, np.ndarray]:
-    """Return what some teams see, as views.
-
-    :param observations: of all teams, by key: n_teams rows, or n_teams * n_agents
-    :param teams: which ones
-    :param n_teams: number of all teams
-    """
-    taken = {}
-    for key, value in observations.items():
-        each = len(value) // n_teams
-        taken[key] = value[teams.start * each : teams.stop * each]
-    return taken
 
 
 def act(

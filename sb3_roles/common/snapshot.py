@@ -12,17 +12,18 @@ import random
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_roles._version import __version__
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError
-from sb3_roles.common.native_vec_env import NativeTeamVecEnv
+from sb3_roles.common.env_state import env_state, laid_out_like, set_env_state
 from sb3_roles.common.team_wrapper import find_team_env
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
@@ -55,47 +56,6 @@ def differences(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     ]
 
 
-# Environments
-
-
-def _wrappers(env: VecEnv) -> Iterator[VecEnvWrapper]:
-    layer: Any = env
-    while isinstance(layer, VecEnvWrapper):
-        yield layer
-        layer = layer.venv
-
-
-def _team_rows(env: VecEnv) -> list[int]:
-    """One row for each environment below: the native backend has one for all teams."""
-    team_env = find_team_env(env)
-    native = isinstance(team_env, NativeTeamVecEnv)
-    return [0] if native else list(range(0, team_env.num_envs, team_env.n_agents))
-
-
-def env_gap(env: VecEnv) -> str | None:
-    """Return why an environment can not be continued bit for bit; None if it can."""
-    team_env = find_team_env(env)
-    for method in ("get_state", "set_state"):
-        try:
-            owners = team_env.get_attr(method, indices=0)
-        except AttributeError:
-            owners = [None]
-        if not callable(owners[0]):
-            metadata = team_env.metadata or {}
-            return f"environment {metadata.get('name', 'of this run')} offers no {method}"
-    return None
-
-
-def _env_state(env: VecEnv) -> dict[str, Any]:
-    gap = env_gap(env)
-    team_env = find_team_env(env)
-    teams = None
-    if gap is None:
-        teams = [team_env.env_method("get_state", indices=row)[0] for row in _team_rows(env)]
-    layers = [layer.get_state() for layer in _wrappers(env) if hasattr(layer, "get_state")]
-    return {"teams": teams, "wrappers": layers}
-
-
 def _begin_anew(model: OnPolicyAlgorithm, env: VecEnv) -> None:
     """Start new episodes, of streams that are a function of the run's seed and of where it is.
 
@@ -108,17 +68,6 @@ def _begin_anew(model: OnPolicyAlgorithm, env: VecEnv) -> None:
         env.seed(int(words[0]))
     model._last_obs = env.reset()  # type: ignore[assignment]
     model._last_episode_starts = np.ones(env.num_envs, np.bool_)
-
-
-def _set_env_state(env: VecEnv, state: Mapping[str, Any]) -> None:
-    team_env, rows = find_team_env(env), _team_rows(env)
-    if len(state["teams"]) != len(rows):
-        raise CheckpointError("the environments' state is of another number of teams")
-    for row, one in zip(rows, state["teams"], strict=True):
-        team_env.env_method("set_state", one, indices=row)
-    layers = [layer for layer in _wrappers(env) if hasattr(layer, "set_state")]
-    for layer, one in zip(layers, state["wrappers"], strict=True):
-        layer.set_state(one)
 
 
 # Random numbers
@@ -146,6 +95,16 @@ def set_rng_state(state: Mapping[str, Any]) -> None:
     np.random.set_state((name, keys, position, has_gauss, gauss))  # noqa: NPY002
     version, internal, gauss_next = state["python"]
     random.setstate((version, tuple(int(word) for word in internal), gauss_next))
+
+
+@contextmanager
+def kept_rng() -> Iterator[None]:
+    """Put the global generators back at the end, for what draws from them on its own behalf."""
+    state = rng_state()
+    try:
+        yield
+    finally:
+        set_rng_state(state)
 
 
 # The model
@@ -180,7 +139,7 @@ def capture(model: OnPolicyAlgorithm, stateful: Sequence[Any] = ()) -> dict[str,
         "elapsed_ns": time.time_ns() - model.start_time,
         "kl_coefs": list(getattr(model, "kl_coefs", [])),
         "optimizer_rates": [group["lr"] for group in model.policy.optimizer.param_groups],
-        "env": _env_state(model.env),
+        "env": env_state(model.env),
         "last_obs": dict(last_obs) if isinstance(last_obs, dict) else {"": last_obs},
         "last_episode_starts": np.asarray(model._last_episode_starts),
         "lstm": None if lstm is None else [[t.cpu().numpy() for t in pair] for pair in lstm],
@@ -287,7 +246,7 @@ def restore(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
         if state["env"]["teams"] is None:
             _begin_anew(model, model.env)
         else:
-            _set_env_state(model.env, state["env"])
+            set_env_state(model.env, state["env"])
             _set_observations(model, state)
             if state["lstm"] is not None:
                 _set_lstm(model, state["lstm"])
@@ -316,9 +275,7 @@ def _set_observations(model: OnPolicyAlgorithm, state: Mapping[str, Any]) -> Non
     for key, template in templates.items():
         if saved[key].shape != template.shape or saved[key].dtype != template.dtype:
             raise CheckpointError(f"the last observation {key!r} has another shape or dtype")
-        # Laid out like the environment's: convolutions choose their kernel by it.
-        restored[key] = np.empty_like(template)
-        np.copyto(restored[key], saved[key])
+        restored[key] = laid_out_like(template, saved[key])
     model._last_obs = restored if is_dict else restored[""]
     model._last_episode_starts = np.array(state["last_episode_starts"])
 

@@ -89,11 +89,13 @@ class HMAPPO(MAPPO):
         )
         return [role, *super()._settings()]
 
-    def _stream_rewards(self, env: VecEnv, rewards: np.ndarray) -> np.ndarray:
+    def stream_rewards(self, env: VecEnv, rewards: np.ndarray) -> np.ndarray:
+        """Return role and primitive rewards of the last step, float32 (n, 2)."""
         wrapper = role_wrapper_of(env)
         if wrapper is None:
             raise ValueError(f"no RoleWrapper around {env}: roles are part of its actions")
         return wrapper.stream_rewards
 
-    def _to_env(self, actions: np.ndarray) -> np.ndarray:
+    def to_env(self, actions: np.ndarray) -> np.ndarray:
+        """Return the pairs of role and move as they are."""
         return actions

@@ -19,17 +19,8 @@ from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
 from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
 from sb3_roles.common.policies import TeamPolicy
-from sb3_roles.common.rollouts import (
-    Acted,
-    TeamGroup,
-    act,
-    expected_values,
-    join,
-    make_groups,
-    split_teams,
-    take_teams,
-    truncation_values,
-)
+from sb3_roles.common.rollout_steps import LocalPlayer, RolloutPlayer
+from sb3_roles.common.rollouts import make_groups, split_teams
 from sb3_roles.common.shards import Gradients, add_gradients, shards_of
 from sb3_roles.common.team_wrapper import AGENT_KEY, TeamWrapper, find_team_env
 from sb3_roles.common.threads import ThreadCrew
@@ -153,6 +144,7 @@ class MAPPO(OnPolicyAlgorithm):
         self.rollout_groups = rollout_groups
         self.target_kl = target_kl
         self.kl_coefs: list[float] = []
+        self.player: RolloutPlayer = LocalPlayer(self)
         check_positive(n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs)
         check_positive(n_shards=n_shards, rollout_groups=rollout_groups)
         check_unit(gamma=gamma, gae_lambda=gae_lambda)
@@ -170,6 +162,9 @@ class MAPPO(OnPolicyAlgorithm):
                 check_not_negative(**{name: schedule})
         if _init_setup_model:
             self._setup_model()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "player"]
 
     @classmethod
     def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -209,11 +204,24 @@ class MAPPO(OnPolicyAlgorithm):
             )
         ]
 
-    def _stream_rewards(self, env: VecEnv, rewards: np.ndarray) -> np.ndarray:
-        """Rewards of each stream in the last step, float32 (n, S)."""
+    def discounts(self) -> th.Tensor:
+        """Return the discount of each stream, float32 (S,)."""
+        return th.tensor([stream.gamma for stream in self._settings()], device=self.device)
+
+    def stream_rewards(self, env: VecEnv, rewards: np.ndarray) -> np.ndarray:
+        """Return the rewards of each stream in the last step.
+
+        :param env: the environment
+        :param rewards: float32 (n,), what its step returned
+        :return: float32 (n, S)
+        """
         return rewards[:, None]
 
-    def _to_env(self, actions: np.ndarray) -> np.ndarray:
+    def to_env(self, actions: np.ndarray) -> np.ndarray:
+        """Turn choices into the environment's actions.
+
+        :param actions: int64 (n, S)
+        """
         return actions[:, 0]
 
     def collect_rollouts(
@@ -229,81 +237,36 @@ class MAPPO(OnPolicyAlgorithm):
         """
         assert isinstance(rollout_buffer, TeamRolloutBuffer)
         assert self._last_obs is not None, "no previous observation was provided"
+        last_obs: Any = self._last_obs
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
         callback.on_rollout_start()
         team_env = find_team_env(env)
-        groups = make_groups(team_env.n_teams, team_env.n_agents, self.rollout_groups, self.device)
-        with ThreadCrew(len(groups), self.device, 1 if len(groups) > 1 else None) as crew:
-            for _ in range(n_rollout_steps):
-                obs, chosen = self._act(crew, groups)
-                actions = chosen.actions.cpu().numpy()
-                new_obs, rewards, dones, infos = env.step(self._to_env(actions))
+        groups = make_groups(team_env.n_teams, team_env.n_agents, self.rollout_groups)
+        with self.player.play(env, groups, last_obs, n_rollout_steps) as rollout:
+            for step in rollout.steps:
+                # By these names callbacks find them, as those of SB3's algorithms.
+                obs, chosen, actions, new_obs, rewards, dones, infos, stream_rewards = step
                 self.num_timesteps += env.num_envs
                 callback.update_locals(locals())
                 if not callback.on_step():
                     return False
                 self._update_info_buffer(infos, dones)
-                # A copy: the values at truncations are added to it.
-                stream_rewards = th.tensor(self._stream_rewards(env, rewards), device=self.device)
-                self._bootstrap(crew, groups, stream_rewards, dones, infos)
                 ends = th.as_tensor(dones).to(self.device)
                 rollout_buffer.add_streams(obs, chosen, stream_rewards, ends)
-                self._last_obs = new_obs  # type: ignore[assignment]
+                self._last_obs = new_obs
                 self._last_episode_starts = dones
-            last_values = self._last_values(crew, groups)
+            last_values = rollout.last_values()
         settings = self._settings()
         rollout_buffer.compute_stream_returns(
             last_values,
-            th.tensor([s.gamma for s in settings], device=self.device),
+            self.discounts(),
             th.tensor([s.gae_lambda for s in settings], device=self.device),
             self.normalize_advantage,
         )
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
-
-    def _seen_by(self, group: TeamGroup, n_groups: int) -> dict[str, np.ndarray]:
-        """Return the last observations of a group."""
-        last_obs: Any = self._last_obs
-        if n_groups == 1:
-            return last_obs
-        return take_teams(last_obs, group.teams, find_team_env(self.env).n_teams)
-
-    def _act(self, crew: ThreadCrew, groups: list[TeamGroup]) -> Acted:
-        """Choose the actions of all teams."""
-
-        def of_group(group: TeamGroup) -> Acted:
-            return act(self.policy, self._seen_by(group, len(groups)), group.generator)
-
-        return join(crew.map(of_group, groups))
-
-    def _last_values(self, crew: ThreadCrew, groups: list[TeamGroup]) -> th.Tensor:
-        """Return the values after the last step of all teams, float (n, S)."""
-
-        def of_group(group: TeamGroup) -> th.Tensor:
-            return expected_values(self.policy, self._seen_by(group, len(groups)))
-
-        return th.cat(crew.map(of_group, groups))
-
-    def _bootstrap(
-        self,
-        crew: ThreadCrew,
-        groups: list[TeamGroup],
-        stream_rewards: th.Tensor,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Add the value of the last observation to the last reward of truncated episodes."""
-        if not dones.any():
-            return
-        gamma = th.tensor([s.gamma for s in self._settings()], device=self.device)
-        found = crew.map(lambda one: truncation_values(self.policy, one.rows, dones, infos), groups)
-        for part in found:
-            if part is not None:
-                rows = th.as_tensor(part.rows, device=self.device)
-                counts = th.as_tensor(part.truncated, device=self.device).unsqueeze(1)
-                stream_rewards[rows] += gamma * part.values * counts
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None

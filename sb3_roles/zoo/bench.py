@@ -11,11 +11,12 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.zoo.bench_case import PARTS, TUNED, configure, start_torch
+from sb3_roles.zoo.bench_case import PARTS, TUNED, configure
 from sb3_roles.zoo.bench_compare import RIVALS, rival_label
 from sb3_roles.zoo.bench_memory import memory_cells
 from sb3_roles.zoo.bench_report import Table, cells, machine_lines, plural
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
+from sb3_roles.zoo.machine import start_torch
 from sb3_roles.zoo.options import UsageError
 
 if TYPE_CHECKING:

@@ -5,7 +5,6 @@ Importing this module imports no torch, so that the settings that it reads can s
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -17,50 +16,12 @@ from sb3_roles.zoo.bench_memory import rollout_memory
 from sb3_roles.zoo.bench_report import against, spread
 from sb3_roles.zoo.config import load_settings, merge, resolve
 from sb3_roles.zoo.environments import AREA_SEARCH
-from sb3_roles.zoo.launcher import prepare_process, process_settings
-from sb3_roles.zoo.machine import describe_machine
 
 TUNED = "hmappo native"
 # What the project aims at with its tuned default; reported as met or missed, never asserted.
 RATE_TARGETS = {TUNED: 2_500}
 RATE_AIMS = {TUNED: 4_000}
 PARTS = ("environment", "inference", "buffer", "update")
-# Read by torch and what is below it when they are loaded.
-_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OMP_WAIT_POLICY",
-    "MKL_NUM_THREADS",
-    "GLIBC_TUNABLES",
-    "MALLOC_ARENA_MAX",
-    "LD_PRELOAD",
-)
-
-
-def start_torch(num_threads: int | None) -> dict[str, Any]:
-    """Import torch with the settings of ``train.py``, and describe the machine.
-
-    :param num_threads: threads of torch; None for its default
-    :return: see ``zoo.machine.describe_machine``; also torch, and the settings of its threads
-    """
-    machine = describe_machine()
-    prepare_process()
-    import stable_baselines3
-    import torch as th
-
-    from sb3_roles.common.torch_layers import has_fast_bfloat16
-
-    if num_threads is not None:
-        th.set_num_threads(num_threads)
-    return {
-        **machine,
-        "torch": th.__version__,
-        "stable_baselines3": stable_baselines3.__version__,
-        "torch_threads": th.get_num_threads(),
-        "cpu_capability": th.backends.cpu.get_cpu_capability(),
-        "fast_bfloat16": has_fast_bfloat16(),
-        "process": process_settings(),
-        "environment": {name: os.environ[name] for name in _VARIABLES if name in os.environ},
-    }
 
 
 class Stopwatch:
@@ -141,10 +102,10 @@ class TrainingCase:
         policy, buffer = self.model.policy, self.model.rollout_buffer
         self.watch.watch("update", self.model, "train")
         self.watch.watch("environment", self.model.env, "step")
-        if hasattr(self.model, "rollout_groups"):
+        if hasattr(self.model, "player"):
             # The policy itself runs on other threads.
-            for method in ("_act", "_bootstrap", "_last_values"):
-                self.watch.watch("inference", self.model, method)
+            for method in ("act", "bootstrap", "last_values"):
+                self.watch.watch("inference", self.model.player, method)
         else:
             self.watch.watch("inference", policy, "forward")
         for method in ("add_streams", "add", "compute_stream_returns",

@@ -14,11 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.zoo.bench_case import TrainingCase, configure, start_torch, training_case
+from sb3_roles.zoo.bench_case import TrainingCase, configure, training_case
 from sb3_roles.zoo.bench_memory import available_memory
 from sb3_roles.zoo.bench_report import Table, log_log_slope, machine_lines, plural, spread
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
 from sb3_roles.zoo.env_cases import make_scene
+from sb3_roles.zoo.machine import start_torch
 from sb3_roles.zoo.options import UsageError, names_of, output_file, whole_number
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.zoo.bench_case import TrainingCase, configure, start_torch, training_case
+from sb3_roles.zoo.bench_case import TrainingCase, configure, training_case
 from sb3_roles.zoo.bench_report import (
     Table,
     machine_lines,
@@ -18,6 +18,7 @@ from sb3_roles.zoo.bench_report import (
     spread,
 )
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
+from sb3_roles.zoo.machine import start_torch
 from sb3_roles.zoo.options import several_of
 
 if TYPE_CHECKING:

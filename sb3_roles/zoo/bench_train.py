@@ -17,13 +17,13 @@ from sb3_roles.zoo.bench_case import (
     PARTS,
     TUNED,
     configure,
-    start_torch,
     training_case,
 )
 from sb3_roles.zoo.bench_compare import RIVALS, Comparison, comparison_table
 from sb3_roles.zoo.bench_memory import memory_cells, peak_memory
 from sb3_roles.zoo.bench_report import Table, cells, machine_lines, plural
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
+from sb3_roles.zoo.machine import start_torch
 from sb3_roles.zoo.options import UsageError, int_text, several_of
 
 if TYPE_CHECKING:

@@ -64,8 +64,9 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
-            args = parser.parse_args(arguments if script is None else [script, *arguments])
-            parser = args.parser
+            arguments = arguments if script is None else [script, *arguments]
+            args = parser.parse_args(arguments)
+            args.arguments, parser = arguments, args.parser
             code = args.run(args)
         finally:
             # Here and not at exit, where a closed pipe can no longer be handled.

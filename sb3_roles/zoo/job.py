@@ -23,6 +23,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_roles.common import snapshot
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+from sb3_roles.common.env_state import env_gap
+from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
 from sb3_roles.common.progress_callback import TeamProgressBar
 from sb3_roles.common.team_wrapper import find_team_env
@@ -34,6 +36,7 @@ from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run
 from sb3_roles.zoo.launcher import process_settings
 from sb3_roles.zoo.models import check_device, complete, make_env, make_model, steps_of
 from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.ray_options import rollouts_on_ray
 from sb3_roles.zoo.run_folder import (
     CHECKPOINTS,
     RunLock,
@@ -74,11 +77,12 @@ def run_job(job: Mapping[str, Any]) -> int:
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
-        run, lock = _open_run(job)
-        try:
-            return _train_in(run, model, job)
-        finally:
-            lock.release()
+        with rollouts_on_ray(model, config, options):
+            run, lock = _open_run(job)
+            try:
+                return _train_in(run, model, job)
+            finally:
+                lock.release()
     finally:
         env.close()
 
@@ -181,6 +185,9 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
             if options["verbose"] > 1:
                 raise
             raise TrainingFailed(f"{run}: {one_line(error)}") from error
+        except RolloutsLost as error:
+            message = f"{run}: {error}; --resume goes on from the last checkpoint"
+            raise TrainingFailed(message) from error
         except RuntimeError as error:
             # Torch's way to say so, on a CPU and on a GPU.
             if "memory" not in str(error):
@@ -241,7 +248,7 @@ def _read_newest(
     machine, trained = (checkpoint.manifest.get(name) for name in ("machine", "config"))
     saved = machine if isinstance(machine, dict) else {}
     reasons = snapshot.differences(saved, snapshot.machine_facts(model.device))
-    gap = snapshot.env_gap(model.env)
+    gap = env_gap(model.env)
     reasons += [] if gap is None else [gap]
     before = trained.get("n_timesteps") if isinstance(trained, dict) else None
     if before != config["n_timesteps"]:

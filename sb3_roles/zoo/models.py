@@ -149,6 +149,20 @@ def _defaults(cls: type, ranges: Mapping[str, Range], given: Mapping[str, Any]) 
     return defaults
 
 
+def small_config(config: Mapping[str, Any], n_teams: int) -> dict[str, Any]:
+    """Return the configuration of fewer teams, with which nothing is trained.
+
+    :param config: checked
+    :param n_teams: number of teams
+    """
+    small = {**config, "n_envs": n_teams}
+    if "batch_size" in config:
+        small["batch_size"] = config.get("n_steps", 1)
+    if "rollout_groups" in config:
+        small["rollout_groups"] = 1
+    return small
+
+
 def steps_of(checkpoint: Checkpoint, name: str) -> int:
     """Return a number of steps that a checkpoint's manifest states.
 
@@ -182,12 +196,7 @@ def load_model(
     folder = Path(run)
     config = read_run_config(folder)
     check_named(folder, config["env"], env)
-    small = {**config, "n_envs": 1}
-    # Of one team now; nothing is trained with it.
-    if "batch_size" in config:
-        small["batch_size"] = config.get("n_steps", 1)
-    if "rollout_groups" in config:
-        small["rollout_groups"] = 1
+    small = small_config(config, 1)
     try:
         if best:
             checkpoint = read_checkpoint(folder / BEST / WEIGHTS_FILE)

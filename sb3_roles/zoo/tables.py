@@ -17,6 +17,7 @@ from sb3_roles.evaluation.report import PAGE
 from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
 from sb3_roles.zoo.machine import usable_cores
 from sb3_roles.zoo.options import UsageError, names_of, whole_number
+from sb3_roles.zoo.ray_options import import_ray
 from sb3_roles.zoo.row_runs import LOGS, PLAN, config_of_row
 
 if TYPE_CHECKING:
@@ -240,10 +241,8 @@ def _crew(args: Namespace, store: RecordStore) -> Iterator[Crew | None]:
     if args.ray is None:
         yield None
         return
-    try:
-        from sb3_roles.evaluation.grid.ray_crew import RayCrew, RayError
-    except ImportError:
-        raise UsageError("argument --ray: install sb3_roles[ray] to use it") from None
+    import_ray()
+    from sb3_roles.evaluation.grid.ray_crew import RayCrew, RayError
     from sb3_roles.zoo.entrants import make_controller
 
     try:

@@ -33,6 +33,7 @@ from sb3_roles.zoo.options import (
     parse_value,
     whole_number,
 )
+from sb3_roles.zoo.ray_options import add_ray_options, check_ray_options, connected_to
 from sb3_roles.zoo.run_folder import ARGS_FILE
 
 if TYPE_CHECKING:
@@ -71,6 +72,8 @@ _GIVEN = frozenset(
         "hyperparams",
         "conf_file",
         "resume",
+        "ray",
+        "rollout_workers",
     }
 )
 # What may be given together with --resume; the rest is the run's.
@@ -83,6 +86,8 @@ _FREE = (
     "progress",
     "verbose",
     "save_freq",
+    "ray",
+    "rollout_workers",
 )
 _STORED = ("eval_freq", "eval_episodes", "save_freq", "log_interval", "tensorboard_log")
 _STORED_RANGES: dict[str, tuple[int, int]] = {
@@ -145,7 +150,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--vec-env, too, where they are not given")  # fmt: skip
     add("--seed", type=whole_number(0, MAX_TRAINING_SEED), metavar="S", help="seed of the run")
     add("--n-seeds", type=whole_number(1, 1000), metavar="K", help="runs with seeds S .. S+K-1, "
-        "one after the other")  # fmt: skip
+        "one after the other, or with --ray side by side")  # fmt: skip
     add("--vec-env", type=one_of("backend", VEC_ENVS), metavar="NAME", help="native, supersuit or "
         "auto")  # fmt: skip
     add("-f", "--log-folder", metavar="DIR", help="folder of the runs")
@@ -162,6 +167,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "cuda or auto")  # fmt: skip
     add("--num-threads", type=whole_number(1, 1024), metavar="T", help="threads of torch; by "
         "default torch's own choice")  # fmt: skip
+    add_ray_options(add)
     add("-P", "--progress", action="store_true", help="show a progress bar")
     add("--resume", type=Path, metavar="RUN", help="run folder to continue bit for bit; needs "
         "--env, too, if that is module:factory")  # fmt: skip
@@ -196,11 +202,15 @@ def run(args: argparse.Namespace) -> int:
             options = _options(given)
             seeds = range(options["seed"], options["seed"] + options["n_seeds"])
             jobs = [_new_job(given, {**options, "seed": seed}) for seed in seeds]
+        for job in jobs:
+            check_ray_options(job["options"], job["config"])
     except ConfigError as error:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
         return EXIT_ERROR
     prepare_process()
+    if len(jobs) > 1 and "ray" in given:
+        return _fan_out(args, jobs)
     from sb3_roles.zoo.job import TrainingFailed, run_job
 
     try:
@@ -212,6 +222,23 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.parser.prog}: error: {error}", file=sys.stderr)
         return EXIT_DIVERGED
     return 0
+
+
+def _fan_out(args: argparse.Namespace, jobs: list[dict[str, Any]]) -> int:
+    """Train all jobs, which differ in their seeds, on a cluster."""
+    options = jobs[0]["options"]
+    cluster = connected_to(options["ray"])
+    import torch as th
+
+    from sb3_roles.zoo.ray_runs import run_on_ray
+
+    # The same as here, where a run alone would take torch's choice: sums depend on it.
+    n_threads = options["num_threads"] or th.get_num_threads()
+    seeds = [job["config"]["seed"] for job in jobs]
+    try:
+        return run_on_ray(args.arguments, seeds, options, n_threads)
+    finally:
+        cluster.disconnect()
 
 
 def _options(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,22 +1,14 @@
-"""Play the blocks of a grid on a Ray cluster; only this module imports Ray (extra ``ray``)."""
+"""Play the blocks of a grid on a Ray cluster (extra ``ray``)."""
 
 from __future__ import annotations
 
-import logging
-import os
-import socket
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-# Read when Ray is imported: it tells nobody that it is used.
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-
-import ray
-from ray.exceptions import RayError as _RayError
-
 from sb3_roles.common.names import one_line
+from sb3_roles.common.ray_cluster import RayError, cluster_cpus, connect, disconnect, ray
 from sb3_roles.evaluation.grid.crews import (
     Controllers,
     Finished,
@@ -28,16 +20,10 @@ from sb3_roles.evaluation.grid.crews import (
 from sb3_roles.evaluation.grid.store import RecordStore
 from sb3_roles.evaluation.records import EpisodeRecords
 
-LOCAL = "local"
+__all__ = ["RayCrew", "RayError"]
+
 # Losses of a worker or of its machine; errors of a controller are no reason to try again.
 MAX_RETRIES = 5
-# Records and weights are small; Ray would take a third of the memory.
-_OBJECT_STORE_BYTES = 100_000_000
-_SECONDS_TO_CONNECT = 10.0
-
-
-class RayError(RuntimeError):
-    """No cluster could be reached or started; one line."""
 
 
 class RayCrew:
@@ -54,15 +40,7 @@ class RayCrew:
     """
 
     def __init__(self, address: str, make: Make, store: RecordStore, n_cpus: int = 1) -> None:
-        _check_address(address)
-        own: dict[str, Any] = {}
-        if address == LOCAL:
-            own = {"num_cpus": n_cpus, "include_dashboard": False}
-            own["object_store_memory"] = _OBJECT_STORE_BYTES
-        try:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
-        except (ConnectionError, ValueError, RuntimeError, OSError) as error:
-            raise RayError(f"{address}: no Ray cluster: {one_line(error)[:200]}") from None
+        connect(address, n_cpus)
         self._make, self._store = make, store
         self._running: dict[Any, Task] = {}
         self._files: dict[Any, Any] = {}
@@ -71,7 +49,7 @@ class RayCrew:
     @property
     def size(self) -> int:
         """CPUs of the cluster, which may come and go."""
-        return max(1, int(ray.cluster_resources().get("CPU", 1)))
+        return cluster_cpus()
 
     @property
     def has_room(self) -> bool:
@@ -92,26 +70,13 @@ class RayCrew:
         task = self._running.pop(done)
         try:
             answer = ray.get(done)
-        except _RayError as failure:
+        except ray.exceptions.RayError as failure:
             return Finished(task, error=f"Ray: {one_line(failure)[:200]}")
         return keep(Finished(task, *answer), self._store)
 
     def close(self) -> None:
         """Leave the cluster, which ends what it still plays, and stop it if it was started here."""
-        ray.shutdown()
-
-
-def _check_address(address: str) -> None:
-    """Find out whether anybody listens: Ray would try for minutes."""
-    if address in (LOCAL, "auto"):
-        return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not (host and port.isdecimal()):
-        raise RayError(f"must be {LOCAL}, auto or HOST:PORT, got {address!r}")
-    try:
-        socket.create_connection((host, int(port)), _SECONDS_TO_CONNECT).close()
-    except (OSError, OverflowError) as error:
-        raise RayError(f"{address}: no Ray cluster: {one_line(error)}") from None
+        disconnect()
 
 
 @lru_cache(maxsize=1)
