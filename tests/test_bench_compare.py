@@ -137,7 +137,9 @@ def test_a_rival_with_more_epochs_is_refused(capsys, monkeypatch):
     config = configure(n_envs=2)
     steps, epochs = 2 * config["n_steps"], config["n_epochs"]
     assert f"samples_times_epochs is {4 * 5 * steps:,} in {steps} joint steps" in captured.err
-    assert f"and {4 * epochs * steps:,} in {steps} of the tuned default" in captured.err
+    # By itself and before the rival.
+    both = 2 * steps
+    assert f"and {4 * epochs * both:,} in {both:,} of the tuned default" in captured.err
 
 
 def test_stock_ppo_reads_the_state_with_its_critic_only():
@@ -162,7 +164,8 @@ def test_the_comparison_is_reported(capsys):
     assert main(["bench", "train", "--compare", *options]) == 0
     report = json.loads(capsys.readouterr().out)
     (tuned,) = report["cases"]
-    assert tuned["work"]["joint_steps"] == 2 * 2 * 2 * configure()["n_steps"]
+    # Two iterations by itself, and before each of the stock rivals, in each of two rounds.
+    assert tuned["work"]["joint_steps"] == 2 * (3 * 2) * 2 * configure()["n_steps"]
     found = {one["name"]: one for one in report["comparisons"]}
     assert list(found) == list(RIVALS)
     assert [one["measured"] for one in found.values()] == ["training", "training", "update"]
@@ -186,7 +189,7 @@ def test_a_comparison_takes_only_what_is_named():
     case = training_case(TUNED, config)
     comparison = Comparison(case, config, ["literal"])
     case.measure(1)
-    comparison.measure()
+    comparison.measure(1)
     assert [one["name"] for one in comparison.describe()] == ["literal"]
     comparison.close()
     case.close()

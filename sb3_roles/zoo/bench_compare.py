@@ -60,20 +60,24 @@ class Comparison:
             if name.startswith("stock-")
         }
         self.literal = LiteralUpdate(tuned.model) if "literal" in names else None
+        self.ratios: dict[str, list[float]] = {name: [] for name in self.stock}
         self.difference = 0.0
         # Joint steps per second of updates alone, on the same rollouts.
         self.literal_rates: list[float] = []
         self.tuned_rates: list[float] = []
         self.literal_work = Work()
 
-    def measure(self) -> None:
-        """Measure all rivals once, behind the tuned default.
+    def measure(self, iterations: int) -> None:
+        """Measure all rivals once, each of them right behind the tuned default.
 
+        :param iterations: of the tuned default; rivals make one
         :raises UsageError: if the work, or the literal forward pass, is not the same
         """
         for name, case in self.stock.items():
+            self.tuned.measure(iterations)
             case.measure(1)
             check_same_work(name, self.tuned.work, case.work)
+            self.ratios[name].append(self.tuned.rates[-1] / case.rates[-1])
         if self.literal is not None:
             self.literal.load()
             self.difference = max(self.difference, self.literal.check())
@@ -92,9 +96,7 @@ class Comparison:
                     "name": name,
                     "measured": "training",
                     "joint_steps_per_second": spread(case.rates),
-                    "ratio": against(
-                        spread(ratios(self.tuned.rates, case.rates)), RATIO_TARGETS.get(name)
-                    ),
+                    "ratio": against(spread(self.ratios[name]), RATIO_TARGETS.get(name)),
                     "parameters": sum(one.numel() for one in case.model.policy.parameters()),
                     "work": asdict(case.work),
                 }

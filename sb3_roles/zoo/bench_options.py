@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,6 @@ from sb3_roles.zoo.bench_report import (
     machine_lines,
     plural,
     range_text,
-    ratios,
     spread,
 )
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
@@ -104,14 +103,22 @@ def run(args: Namespace) -> int:
             name: stack.enter_context(closing(training_case(name, config)))
             for name, config in configs.items()
         }
+        found: dict[str, list[float]] = {name: [] for name in cases if name != DEFAULT}
         for _ in range(args.repeats):
-            for name, case in cases.items():
-                case.measure(args.iterations, changes[name].num_threads)
+            for name, measured in found.items():
+                # Right behind what it is compared with.
+                other = cases[changes[name].against]
+                other.measure(args.iterations)
+                cases[name].measure(args.iterations, changes[name].num_threads)
+                measured.append(cases[name].rates[-1] / other.rates[-1])
         report = {
             "config": {"iterations": args.iterations, "repeats": args.repeats},
             "machine": machine,
             "default": {**cases[DEFAULT].describe(), "config": configs[DEFAULT]},
-            "changes": [_describe(name, changes[name], cases) for name in cases if name != DEFAULT],
+            "changes": [
+                _describe(name, changes[name], cases[name], measured)
+                for name, measured in found.items()
+            ],
             "same_as_default": same,
         }
     print_report(args, report, _head(report), [_table(report)])
@@ -132,13 +139,14 @@ def _same_as_default(
     ]
 
 
-def _describe(name: str, change: Change, cases: Mapping[str, TrainingCase]) -> dict[str, Any]:
-    case, other = cases[name], cases[change.against]
+def _describe(
+    name: str, change: Change, case: TrainingCase, measured: Sequence[float]
+) -> dict[str, Any]:
     return {
         "change": name,
         "against": change.against,
         "joint_steps_per_second": spread(case.rates),
-        "ratio": spread(ratios(case.rates, other.rates)),
+        "ratio": spread(measured),
         "work": case.describe()["work"],
     }
 

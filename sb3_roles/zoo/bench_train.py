@@ -128,7 +128,7 @@ def measure(
             for case in cases.values():
                 case.measure(iterations)
             if comparison is not None:
-                comparison.measure()
+                comparison.measure(iterations)
         return {
             "config": {"iterations": iterations, "repeats": repeats},
             "cases": [case.describe() for case in cases.values()],
