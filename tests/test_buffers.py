@@ -10,6 +10,12 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 
 from sb3_roles import HMAPPO, RoleWrapper
 from sb3_roles.common.buffers import TeamRolloutBuffer
+from sb3_roles.common.observation_store import (
+    pack_bits,
+    pack_by_shifts,
+    unpack_bits,
+    unpack_by_shifts,
+)
 from sb3_roles.common.policies import Streams
 from sb3_roles.hmappo import RoleActorCriticPolicy
 
@@ -20,6 +26,7 @@ SPACE = spaces.Dict(
         "where": spaces.Box(-np.inf, np.inf, (3,), np.float32),
         "own": spaces.Box(0, 255, (2, 4, 5), np.uint8),
         "shared": spaces.Box(0, 255, (3, 6, 4), np.uint8),
+        "flags": spaces.Box(0, 1, (2, 5, 3), np.uint8),
         "agent": spaces.Box(0, np.inf, (2,), np.float32),
     }
 )
@@ -34,6 +41,7 @@ def observation(t, rng, once=True):
         "where": np.stack([np.full(ROWS, t), team, agent], axis=1).astype(np.float32),
         "own": rng.integers(0, 255, (ROWS, 2, 4, 5)).astype(np.uint8),
         "shared": shared if once else shared.repeat(N_AGENTS, axis=0),
+        "flags": rng.integers(0, 2, (ROWS, 2, 5, 3)).astype(np.uint8),
         "agent": np.stack([agent, np.full(ROWS, N_AGENTS)], axis=1).astype(np.float32),
     }
 
@@ -185,14 +193,26 @@ def test_a_batch_in_rows_is_rounded_down_to_whole_teams():
     assert [len(samples.actions) for samples in buffer.get(1)] == [3] * 20
 
 
-def test_what_a_team_shares_is_stored_once_as_bytes():
+def test_what_a_team_shares_is_stored_once_as_bytes_and_flags_as_bits():
     once, for_each = make_buffer(), make_buffer()
     fill_streams(once, True)
     fill_streams(for_each, False)
-    per_row = 3 * 4 + 2 * 4 + 2 * 4 * 5
+    per_row = 3 * 4 + 2 * 4 + 2 * 4 * 5 + -(-2 * 5 * 3 // 8)
     shared = 3 * 6 * 4
     assert once.nbytes == T * (ROWS * per_row + N_TEAMS * shared)
     assert for_each.nbytes == T * ROWS * (per_row + shared)
+
+
+@pytest.mark.parametrize("count", [1, 8, 30, 41])
+def test_bits_come_back_on_every_device(count):
+    rng = np.random.default_rng(count)
+    flags = th.as_tensor(rng.integers(0, 2, (7, count)).astype(np.uint8))
+    packed = pack_bits(flags)
+    assert packed.shape == (7, -(-count // 8)) and packed.dtype == th.uint8
+    assert th.equal(unpack_bits(packed, count), flags)
+    # What other devices than the CPU do.
+    assert th.equal(pack_by_shifts(flags), packed)
+    assert th.equal(unpack_by_shifts(packed, count), flags)
 
 
 def test_maps_leave_the_buffer_as_they_came_with_channels_last_in_memory():

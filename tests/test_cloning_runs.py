@@ -12,7 +12,7 @@ from sb3_roles.gnn.recording import record
 from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import load_settings
 from sb3_roles.zoo.run_folder import CHECKPOINTS
-from sb3_roles.zoo.train import DEFAULTS
+from sb3_roles.zoo.train_jobs import DEFAULTS
 
 NETWORK = "policy_kwargs:{n_hops: 1, hop_width: 4, encoder: patches, value_arch: [4]}"
 SIZES = ["height:11", "width:11", "n_targets:12", "horizon:10", "n_agents:3"]

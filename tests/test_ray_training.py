@@ -19,7 +19,7 @@ from ray.cluster_utils import Cluster
 from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.zoo import ray_rollouts
 from sb3_roles.zoo.cli import main
-from sb3_roles.zoo.ray_runs import seed_arguments, train_run
+from sb3_roles.zoo.ray_runs import RunOf, run_arguments, train_run
 
 ROOT = Path(__file__).resolve().parents[1]
 NODE = {"num_cpus": 1, "object_store_memory": 100_000_000, "include_dashboard": False}
@@ -164,8 +164,8 @@ def test_runs_side_by_side(cluster, tmp_path, capfd):
     assert main(options, "train") == 0
     lines = capfd.readouterr().out.splitlines()
     assert [line for line in lines if not line.startswith(" ")] == [
-        "seed 3: exit code 0",
-        "seed 4: exit code 0",
+        "hmappo, seed 3: exit code 0",
+        "hmappo, seed 4: exit code 0",
     ]
     assert sum("held-out episodes of seed 1" in line for line in lines) == 2
     found = []
@@ -200,7 +200,11 @@ def test_a_run_elsewhere_says_how_it_ended(tmp_path):
 
 
 def test_a_run_elsewhere_has_a_command_of_its_own():
-    given = ["train", "--ray=auto", "--algo", "ppo", "--seed", "3", "--n-seeds=2", "-n5"]
-    assert seed_arguments([*given, "--num-threads", "4"], 4, 1) == (
-        ["train", "--algo", "ppo", "-n5", "--seed", "4", "--num-threads", "1"]
+    given = ["train", "--ray=auto", "--algo", "ppo,mappo", "--seed", "3", "--n-seeds=2", "-n5"]
+    given += ["--vary", "gamma:0.9", "gamma:0.95", "-params", "n_envs:4", "--num-threads", "4"]
+    common = ["train", "-n5", "-params", "n_envs:4"]
+    own = ["--algo", "ppo", "--seed", "4", "--num-threads", "1"]
+    assert run_arguments(given, RunOf("ppo", None, 4), 1) == common + own
+    assert run_arguments(given, RunOf("ppo", "gamma:0.9", 4), 1) == (
+        [*common, *own, "--hyperparams", "gamma:0.9"]
     )

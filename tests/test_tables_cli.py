@@ -478,12 +478,13 @@ def test_commands_for_parameters_come_back_as_they_were(tmp_path):
     row = row_of("hmappo", params={**TINY, "kl_coef": 0.25, "learning_rate": "lin_1.0e-3"})
     words = shlex.split(training_command(row, tmp_path))[1:]
     from sb3_roles.zoo.cli import make_parser
-    from sb3_roles.zoo.train import _GIVEN, _new_job, _options
+    from sb3_roles.zoo.train_jobs import GIVEN, new_jobs
 
-    given = {k: v for k, v in vars(make_parser().parse_args(words)).items() if k in _GIVEN}
+    given = {k: v for k, v in vars(make_parser().parse_args(words)).items() if k in GIVEN}
     given = {key: value for key, value in given.items() if value is not None}
-    config = _new_job(given, _options(given))["config"]
-    assert config == config_of_row(row)
+    _, jobs = new_jobs(given)
+    assert [job["config"]["seed"] for job in jobs] == [0, 1, 2]
+    assert jobs[0]["config"] == config_of_row(row)
     assert given["n_seeds"] == 3
 
 

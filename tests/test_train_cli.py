@@ -86,10 +86,19 @@ WRONG = [
         "must be the environment's, 5, got 4",
     ),
     (["--env-kwargs", "reward_sharing:same_role"], "wrapper_kwargs.reward_sharing"),
-    (["-params", "rollout_groups:65"], "rollout_groups must be at most n_envs = 64 teams, got 65"),
+    (
+        ["-params", "rollout_groups:129"],
+        "rollout_groups must be at most n_envs = 128 teams, got 129",
+    ),
     (["--rollout-workers", "2"], "--rollout-workers needs --ray ADDRESS"),
-    (["--ray", "local"], "--ray needs --n-seeds K of at least 2"),
+    (["--ray", "local"], "--ray needs several runs"),
     (["--ray", "local", "--n-seeds", "2", "--rollout-workers", "2"], "not both"),
+    (["--ray", "local", "--vary", "gamma:0.9", "gamma:0.8", "--rollout-workers", "2"], "not both"),
+    (["--vary", "gamma"], "must be key:value"),
+    (["--vary", "gama:0.9"], "did you mean 'gamma'?"),
+    (["--vary", "gamma:0.9", "-params", "gamma:0.8"], "gamma is given in --vary and in"),
+    (["--algo", "hmappo,mapo"], "did you mean 'mappo'?"),
+    (["--algo", "hmappo,mappo", "-conf", "zoo_configs/hmappo.yml"], "of one algorithm"),
     (
         ["--ray", "local", "--rollout-workers", "3"],
         "--rollout-workers 3: the configuration's rollout_groups is 2",
@@ -192,6 +201,20 @@ def test_run_folder(logs):
         assert text in output
     second = yaml.safe_load((folder / "mappo" / "area-search-v0_2" / "config.yml").read_text())
     assert second["seed"] == 6
+
+
+def test_a_run_for_each_algorithm_and_change(tmp_path, capsys):
+    tiny = ["n_envs:2", "n_steps:4", "batch_size:8", "rollout_groups:1", "n_shards:1"]
+    several = ["--algo", "mappo,hmappo", "--vary", "gamma:0.9", "gamma:0.8"]
+    once = ["-n", "8", "--eval-freq", "0", "--eval-episodes", "1", "--verbose", "0"]
+    code, _, err = run_main(capsys, *several, "-params", *tiny, *once, "-f", str(tmp_path))
+    assert code == 0, err
+    found = []
+    for algo in ("mappo", "hmappo"):
+        for run in sorted((tmp_path / algo).iterdir()):
+            config = yaml.safe_load((run / "config.yml").read_text())
+            found.append((config["algo"], config["gamma"], config["n_envs"]))
+    assert found == [(algo, gamma, 2) for algo in ("mappo", "hmappo") for gamma in (0.9, 0.8)]
 
 
 def test_config_of_a_run_repeats_it(logs, tmp_path):

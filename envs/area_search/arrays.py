@@ -150,12 +150,17 @@ class TeamArrays:
 
     def _bind_kernels(self) -> None:
         """Gather each kernel's arguments once: they are the same arrays at every step."""
-        parts = even_slices(self.n_teams, self._n_threads)
+        # Without searches a step is over before another thread has begun.
+        n_threads = 1 if self.sub_goal == "none" else self._n_threads
+        parts = even_slices(self.n_teams, n_threads)
         self._threads = SliceThreads([TeamSlice(self, part) for part in parts])
 
     @property
     def n_threads(self) -> int:
-        """Threads that work on the teams of a step; what they compute does not depend on it."""
+        """Threads that work on the teams of a step; what they compute does not depend on it.
+
+        With ``sub_goal="none"`` one does, whatever is set.
+        """
         return self._n_threads
 
     @n_threads.setter

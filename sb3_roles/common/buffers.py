@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 
 from sb3_roles.common.losses import lambda_returns
+from sb3_roles.common.observation_store import ObservationStore, take_groups
 from sb3_roles.common.policies import Streams
 from sb3_roles.common.team_wrapper import AGENT_KEY
 
@@ -32,50 +33,13 @@ class TeamSamples(NamedTuple):
     """bool (n, S)"""
 
 
-def take_groups(memory: th.Tensor, index: th.Tensor, size: int) -> th.Tensor:
-    """Gather groups of consecutive rows.
-
-    :param memory: (T, n, ...), contiguous
-    :param index: int64 (b,), numbers of groups
-    :param size: rows in a group
-    :return: (b * size, ...)
-    """
-    # Whole groups as one row each: several times faster than advanced indexing of many dimensions.
-    groups = memory.view(memory.shape[0] * memory.shape[1] // size, -1)
-    return groups.index_select(0, index).view(-1, *memory.shape[2:])
-
-
-class _MapStore:
-    """The values of one key over time; maps are laid out with their channels last in memory."""
-
-    def __init__(self, buffer_size: int, sample: th.Tensor) -> None:
-        self.is_map = sample.ndim == 4
-        inner = sample.permute(0, 2, 3, 1) if self.is_map else sample
-        self.memory = th.zeros(
-            (buffer_size, *inner.shape), dtype=sample.dtype, device=sample.device
-        )
-
-    def put(self, t: int, value: th.Tensor) -> None:
-        self.memory[t].copy_(value.permute(0, 2, 3, 1) if self.is_map else value)
-
-    def take(self, index: th.Tensor, per_team: int) -> th.Tensor:
-        """Gather (time, team) pairs.
-
-        :param index: int64 (b,), time * n_teams + team
-        :param per_team: rows of this key per team
-        :return: (b * per_team, ...)
-        """
-        taken = take_groups(self.memory, index, per_team)
-        return taken.permute(0, 3, 1, 2) if self.is_map else taken
-
-
 class TeamRolloutBuffer(DictRolloutBuffer):
     """On-policy rollouts of teams, as tensors on the training device.
 
     Minibatches are permutations of (time, team) pairs: the rows of a team stay together and in
     order, which the graph and the team-level maps need. What a team shares is stored once per team
-    when it is given once per team. Stock PPO, A2C, TRPO and MaskablePPO take it as
-    ``rollout_buffer_class``; MAPPO and HMAPPO use its streams.
+    when it is given once per team, and maps of 0 and 1 as bits. Stock PPO, A2C, TRPO and
+    MaskablePPO take it as ``rollout_buffer_class``; MAPPO and HMAPPO use its streams.
 
     :param buffer_size: steps per rollout
     :param observation_space: of one row, with the key ``agent``
@@ -103,7 +67,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 f"TeamRolloutBuffer needs the observation key {AGENT_KEY!r}: wrap the environment "
                 "in TeamWrapper or RoleWrapper"
             )
-        self._stores: dict[str, _MapStore] = {}
+        self._stores: dict[str, ObservationStore] = {}
         self._layout: tuple[Any, ...] = ()
         super().__init__(
             buffer_size,
@@ -133,7 +97,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     def _allocate(self, observations: Mapping[str, th.Tensor], chosen: Streams) -> None:
         self._stores = {
-            key: _MapStore(self.buffer_size, value) for key, value in observations.items()
+            key: ObservationStore(self.buffer_size, value, self.observation_space[key])
+            for key, value in observations.items()
         }
         n_streams = chosen.actions.shape[1]
 
@@ -224,10 +189,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         return take_groups(memory, index, self.n_agents)
 
     def _observations_at(self, index: th.Tensor) -> dict[str, th.Tensor]:
-        return {
-            key: store.take(index, store.memory.shape[1] // self.n_teams)
-            for key, store in self._stores.items()
-        }
+        return {key: store.take(index, self.n_teams) for key, store in self._stores.items()}
 
     def minibatches(self, batch_teams: int) -> Generator[TeamSamples, None, None]:
         """Go once through the rollout, in a random order of (time, team) pairs.

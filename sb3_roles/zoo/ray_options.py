@@ -25,23 +25,23 @@ def add_ray_options(add: Callable[..., None]) -> None:
     :param add: ``add_argument`` of the command
     """
     add("--ray", metavar="ADDRESS", help="use a Ray cluster: its address, auto, or "
-        f"{_LOCAL!r} to start one here (extra ray). With --n-seeds the runs go side by side, each "
-        "on --num-threads CPUs, in a log folder that all machines share; with --rollout-workers "
-        "one run's rollouts are played there")  # fmt: skip
+        f"{_LOCAL!r} to start one here (extra ray). Several runs (--n-seeds, --algo, --vary) go "
+        "side by side, each on --num-threads CPUs, in a log folder that all machines share; with "
+        "--rollout-workers one run's rollouts are played there")  # fmt: skip
     add("--rollout-workers", type=whole_number(1, 1024), metavar="K", help="Ray tasks that play "
         f"rollouts at once, at most the configuration's {_SPLITS}; however many there are, and "
         "whichever of them die, the weights are those of a run without Ray")  # fmt: skip
 
 
-def check_ray_options(options: Mapping[str, Any], config: Mapping[str, Any]) -> None:
+def check_ray_options(options: Mapping[str, Any], config: Mapping[str, Any], several: bool) -> None:
     """Find out whether options go together.
 
     :param options: of the command
-    :param config: of the run, checked
+    :param config: of a run, checked
+    :param several: whether the command asks for several runs
     :raises UsageError: if they do not
     """
     address, workers = options.get("ray"), options.get("rollout_workers")
-    several = options.get("n_seeds", 1) > 1
     if address is None:
         if workers is not None:
             raise UsageError("--rollout-workers needs --ray ADDRESS")
@@ -49,14 +49,14 @@ def check_ray_options(options: Mapping[str, Any], config: Mapping[str, Any]) -> 
     if workers is None:
         if not several:
             raise UsageError(
-                "--ray needs --n-seeds K of at least 2, for runs side by side, or "
+                "--ray needs several runs (--n-seeds, --algo, --vary) to go side by side, or "
                 "--rollout-workers K, for the rollouts of one run"
             )
         return
     if several:
         raise UsageError(
-            "--ray takes --n-seeds, for runs side by side, or --rollout-workers, for the rollouts "
-            "of one run, not both"
+            "--ray takes several runs (--n-seeds, --algo, --vary) to go side by side, or "
+            "--rollout-workers, for the rollouts of one run, not both"
         )
     splitting = [name for name, one in ALGORITHMS.items() if _SPLITS in one.parameters]
     if config["algo"] not in splitting:

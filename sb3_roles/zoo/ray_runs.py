@@ -28,33 +28,56 @@ class Outcome(NamedTuple):
     """the last ones that it printed"""
 
 
-def seed_arguments(arguments: Sequence[str], seed: int, n_threads: int) -> list[str]:
+class RunOf(NamedTuple):
+    """What tells one run of a command line from the others."""
+
+    algo: str
+    change: str | None
+    """``KEY:VALUE`` of the configuration"""
+    seed: int
+
+    def __str__(self) -> str:
+        change = "" if self.change is None else f"{self.change}, "
+        return f"{self.algo}, {change}seed {self.seed}"
+
+
+# What is said of all runs, and how many values it has there; None for as many as there are.
+_OF_ALL = {"--ray": 1, "--n-seeds": 1, "--seed": 1, "--num-threads": 1, "--algo": 1, "--vary": None}
+
+
+def run_arguments(arguments: Sequence[str], run: RunOf, n_threads: int) -> list[str]:
     """Return the command line of one of the runs.
 
     :param arguments: of all of them, the command first
-    :param seed: of the run
+    :param run: which one
     :param n_threads: of torch
     """
-    left, values = [], iter(arguments)
-    for text in values:
+    left: list[str] = []
+    skip: int | None = 0
+    for text in arguments:
         name, equals, _ = text.partition("=")
-        if name in ("--ray", "--n-seeds", "--seed", "--num-threads"):
-            if not equals:
-                next(values)
-            continue
-        left.append(text)
-    return [*left, "--seed", str(seed), "--num-threads", str(n_threads)]
+        if name in _OF_ALL:
+            skip = _OF_ALL[name]
+            if equals and skip is not None:
+                skip -= 1
+        elif skip != 0 and not (skip is None and text.startswith("-")):
+            skip = None if skip is None else skip - 1
+        else:
+            skip = 0
+            left.append(text)
+    left += ["--algo", run.algo, "--seed", str(run.seed), "--num-threads", str(n_threads)]
+    return left if run.change is None else [*left, "--hyperparams", run.change]
 
 
 def run_on_ray(
-    arguments: Sequence[str], seeds: Sequence[int], options: Mapping[str, Any], n_threads: int
+    arguments: Sequence[str], runs: Sequence[RunOf], options: Mapping[str, Any], n_threads: int
 ) -> int:
-    """Train several runs, and print how each has ended, in the order of the seeds.
+    """Train several runs, and print how each has ended, in their order.
 
     A run that is lost with its machine is not begun again: it left a run folder to resume.
 
     :param arguments: of the command, which is the first one
-    :param seeds: of the runs
+    :param runs: the runs
     :param options: of the command
     :param n_threads: of torch, and CPUs of a run
     :return: the first exit code that is not 0, or 0
@@ -69,17 +92,15 @@ def run_on_ray(
         )
     gpus = 1 if options["device"] == "cuda" else 0
     train = ray.remote(num_cpus=n_threads, num_gpus=gpus, max_retries=0)(train_run)
-    running = [
-        train.remote(seed_arguments(arguments, seed, n_threads), os.getcwd()) for seed in seeds
-    ]
+    running = [train.remote(run_arguments(arguments, run, n_threads), os.getcwd()) for run in runs]
     codes = []
-    for seed, run in zip(seeds, running, strict=True):
+    for run, sent in zip(runs, running, strict=True):
         try:
-            outcome = Outcome(*ray.get(run))
+            outcome = Outcome(*ray.get(sent))
         except ray.exceptions.RayError as error:
             outcome = Outcome(EXIT_LOST, [f"lost: {one_line(error)[:200]}"])
         codes.append(outcome.code)
-        print(f"seed {seed}: exit code {outcome.code}", flush=True)
+        print(f"{run}: exit code {outcome.code}", flush=True)
         for line in outcome.lines:
             print(f"  {line}", flush=True)
     return next((code for code in codes if code), 0)

@@ -8,33 +8,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.common.names import closest
 from sb3_roles.zoo.algorithms import ALGORITHMS
-from sb3_roles.zoo.config import (
-    ConfigError,
-    load_identity,
-    load_settings,
-    merge,
-    read_run_config,
-    read_yaml,
-    resolve,
-)
+from sb3_roles.zoo.config import ConfigError
 from sb3_roles.zoo.config_checks import VEC_ENVS
-from sb3_roles.zoo.environments import AREA_SEARCH, check_named
 from sb3_roles.zoo.launcher import prepare_process
 from sb3_roles.zoo.options import (
     DEVICES,
     MAX_TRAINING_SEED,
     KeyValues,
-    UsageError,
     int_text,
     key_value,
     one_of,
     parse_value,
+    several_of,
     whole_number,
 )
 from sb3_roles.zoo.ray_options import add_ray_options, check_ray_options, connected_to
-from sb3_roles.zoo.run_folder import ARGS_FILE
+from sb3_roles.zoo.train_jobs import DEFAULTS, GIVEN, RunName, new_jobs, resumed_job
 
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
@@ -44,59 +34,6 @@ _DESCRIPTION = (
     "Train an algorithm in a new run folder <logs>/<algo>/<env>_<i>, or resume a run. Steps are "
     "joint steps: one of a whole team."
 )
-# Not argparse's own: with --resume it must be known what was given.
-DEFAULTS: dict[str, Any] = {
-    "algo": "hmappo",
-    "env": AREA_SEARCH,
-    "seed": 0,
-    "n_seeds": 1,
-    "vec_env": "auto",
-    "log_folder": "logs",
-    "eval_freq": 50_000,
-    "eval_episodes": 100,
-    "save_freq": 50_000,
-    "log_interval": 1,
-    "tensorboard_log": None,
-    "device": "auto",
-    "num_threads": None,
-    "progress": False,
-    "verbose": 1,
-}
-_GIVEN = frozenset(
-    {
-        *DEFAULTS,
-        "n_timesteps",
-        "scene",
-        "n_agents",
-        "env_kwargs",
-        "hyperparams",
-        "conf_file",
-        "resume",
-        "ray",
-        "rollout_workers",
-    }
-)
-# What may be given together with --resume; the rest is the run's.
-_FREE = (
-    "resume",
-    "env",
-    "n_timesteps",
-    "device",
-    "num_threads",
-    "progress",
-    "verbose",
-    "save_freq",
-    "ray",
-    "rollout_workers",
-)
-_STORED = ("eval_freq", "eval_episodes", "save_freq", "log_interval", "tensorboard_log")
-_STORED_RANGES: dict[str, tuple[int, int]] = {
-    "eval_freq": (0, 10**12),
-    "eval_episodes": (1, 10**6),
-    "save_freq": (0, 10**12),
-    "log_interval": (1, 10**6),
-    "num_threads": (1, 1024),
-}
 
 
 def joint_steps(text: str) -> int:
@@ -111,6 +48,11 @@ def joint_steps(text: str) -> int:
             f"must be a whole number from 1 to {10**12} joint steps, got {text!r}"
         )
     return int(number)
+
+
+def variation(text: str) -> tuple[str, str, Any]:
+    """Read one change of ``--vary``: what was written, key and value."""
+    return (text, *key_value(text))
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -128,8 +70,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             )
             action.help = f"{help} (default: {default}{''.join(own)})"
 
-    add("--algo", type=one_of("algorithm", ALGORITHMS), metavar="NAME",
-        help=f"one of {', '.join(ALGORITHMS)}")  # fmt: skip
+    add("--algo", type=several_of("algorithm", ALGORITHMS), metavar="NAME,...",
+        help=f"from {', '.join(ALGORITHMS)}; with commas between, a run of each")  # fmt: skip
     add("--env", metavar="ID", help="environment, or module:factory of a PettingZoo ParallelEnv, "
         "which is imported and called")  # fmt: skip
     add("-n", "--n-timesteps", type=joint_steps, metavar="N", help="joint steps, instead of the "
@@ -145,6 +87,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--env-kwargs", **pairs, help="arguments of the environment, such as horizon:100")
     add("-params", "--hyperparams", **pairs, help="keys of the configuration to change, such as "
         "gamma:0.9 'policy_kwargs:{graph: false}'")  # fmt: skip
+    add("--vary", type=variation, nargs="+", metavar="KEY:VALUE", help="a run with each of these "
+        "changes instead of one run with all, such as gamma:0.9 gamma:0.95")  # fmt: skip
     add("-conf", "--conf-file", type=Path, metavar="FILE", help="configuration to read instead of "
         "zoo_configs/<algo>.yml; a run's config.yml stands for its --algo, --env, --seed and "
         "--vec-env, too, where they are not given")  # fmt: skip
@@ -187,30 +131,29 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, once per seed.
+    """Train, once for each algorithm, change and seed.
 
     :param args: parsed arguments
     :return: 0; 2 if the configuration is wrong; 3 if a loss or reward is not finite; 130 or 143
         after a signal
     :raises UsageError: if the arguments do not go together
     """
-    given = {key: value for key, value in vars(args).items() if key in _GIVEN and value is not None}
+    given = {key: value for key, value in vars(args).items() if key in GIVEN and value is not None}
+    runs: list[RunName] = []
     try:
         if "resume" in given:
-            jobs = [_resumed_job(given)]
+            jobs = [resumed_job(given)]
         else:
-            options = _options(given)
-            seeds = range(options["seed"], options["seed"] + options["n_seeds"])
-            jobs = [_new_job(given, {**options, "seed": seed}) for seed in seeds]
+            runs, jobs = new_jobs(given)
         for job in jobs:
-            check_ray_options(job["options"], job["config"])
+            check_ray_options(job["options"], job["config"], len(jobs) > 1)
     except ConfigError as error:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
         return EXIT_ERROR
     prepare_process()
     if len(jobs) > 1 and "ray" in given:
-        return _fan_out(args, jobs)
+        return _fan_out(args, runs, jobs[0]["options"])
     from sb3_roles.zoo.job import TrainingFailed, run_job
 
     try:
@@ -224,93 +167,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _fan_out(args: argparse.Namespace, jobs: list[dict[str, Any]]) -> int:
-    """Train all jobs, which differ in their seeds, on a cluster."""
-    options = jobs[0]["options"]
+def _fan_out(args: argparse.Namespace, runs: list[RunName], options: Mapping[str, Any]) -> int:
+    """Train all runs on a cluster."""
     cluster = connected_to(options["ray"])
     import torch as th
 
-    from sb3_roles.zoo.ray_runs import run_on_ray
+    from sb3_roles.zoo.ray_runs import RunOf, run_on_ray
 
     # The same as here, where a run alone would take torch's choice: sums depend on it.
     n_threads = options["num_threads"] or th.get_num_threads()
-    seeds = [job["config"]["seed"] for job in jobs]
     try:
-        return run_on_ray(args.arguments, seeds, options, n_threads)
+        return run_on_ray(args.arguments, [RunOf(*run) for run in runs], options, n_threads)
     finally:
         cluster.disconnect()
-
-
-def _options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all options: the given ones, those of a run's ``config.yml``, and the defaults."""
-    file = given.get("conf_file")
-    if file is None:
-        return {**_defaults(given.get("algo", DEFAULTS["algo"])), **given}
-    identity = load_identity(file)
-    algo = identity.get("algo")
-    if algo is not None and given.get("algo", algo) != algo:
-        raise UsageError(f"{file} is of a run of {algo}: leave --algo {given['algo']} out")
-    if "env" not in given and "env" in identity:
-        check_named(file, identity["env"], None)
-    options = {**identity, **given}
-    return {**_defaults(options.get("algo", DEFAULTS["algo"])), **options}
-
-
-def _defaults(algo: str) -> dict[str, Any]:
-    return {**DEFAULTS, **ALGORITHMS[algo].options}
-
-
-def _new_job(given: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plain data of a job: its configuration and its options."""
-    algo, env = options["algo"], options["env"]
-    settings = load_settings(algo, env, given.get("conf_file"))
-    overrides = dict(given.get("hyperparams", {}))
-    env_kwargs = dict(overrides.get("env_kwargs") or {})
-    for key, value in given.get("env_kwargs", {}).items():
-        if key in env_kwargs and env_kwargs[key] != value:
-            raise UsageError(f"{key} is given in --env-kwargs and in --hyperparams")
-        env_kwargs[key] = value
-    for key in ("scene", "n_agents"):
-        if key in given:
-            if key in env_kwargs:
-                flag = "--" + key.replace("_", "-")
-                raise UsageError(f"give {flag} or --env-kwargs {key}:..., not both")
-            env_kwargs[key] = given[key]
-    if env_kwargs:
-        overrides["env_kwargs"] = env_kwargs
-    if "n_timesteps" in given:
-        overrides["n_timesteps"] = given["n_timesteps"]
-    config = resolve(algo, env, merge(settings, overrides), options["seed"], options["vec_env"])
-    return {"config": config, "options": options, "resume": None}
-
-
-def _resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
-    odd = [key for key in given if key not in _FREE]
-    if odd:
-        name = odd[0].replace("_", "-")
-        raise UsageError(f"--resume continues a run as it is: leave --{name} out")
-    path = Path(given["resume"])
-    config = read_run_config(path)
-    check_named(path, config["env"], given.get("env"))
-    stored = read_yaml(path / ARGS_FILE)
-    if not isinstance(stored, dict):
-        raise ConfigError([f"{path / ARGS_FILE}: must be keys and values"])
-    names = (*_STORED, "device", "num_threads")
-    defaults = _defaults(config["algo"])
-    options = {**defaults, **{name: stored.get(name, defaults[name]) for name in names}, **given}
-    for name, (low, high) in _STORED_RANGES.items():
-        value = options[name]
-        whole = isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
-        if not whole and not (name == "num_threads" and value is None):
-            raise ConfigError(
-                [f"{path / ARGS_FILE}: {name} must be from {low} to {high}, got {value!r}"]
-            )
-    if options["device"] not in DEVICES:
-        message = closest("device", options["device"], DEVICES)
-        raise ConfigError([f"{path / ARGS_FILE}: {message}"])
-    folder = options["tensorboard_log"]
-    if folder is not None and not isinstance(folder, str):
-        raise ConfigError([f"{path / ARGS_FILE}: tensorboard_log must be a text, got {folder!r}"])
-    if "n_timesteps" in given:
-        config["n_timesteps"] = given["n_timesteps"]
-    return {"config": config, "options": options, "resume": path}
