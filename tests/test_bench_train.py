@@ -37,9 +37,10 @@ def test_every_case_does_the_same_counted_work(capsys):
         assert case["cpu_share"] > 0.0
         rate = case["joint_steps_per_second"]
         assert 0.0 < rate["min"] <= rate["median"] <= rate["max"]
-    # Team maps (2 and 5 channels of 625 cells) once per team, local ones (4 of 81) per robot.
-    least = 7 * 625 + 4 * 4 * 81
-    assert least < hmappo["observation_bytes_per_joint_step"] < 2 * least
+    # Bits of the team's maps (2 and 5 channels of 625 cells) once per team, of the local ones (4 of
+    # 81) per robot, and 29 numbers of each robot.
+    bits, numbers = 7 * 625 + 4 * 4 * 81, 4 * 29 * 4
+    assert bits / 8 <= hmappo["observation_bytes_per_joint_step"] - numbers < bits / 8 + 64
     assert hmappo["joint_steps_per_second"]["target"] == 2500
     assert hmappo["aim"]["target"] == 4000
     assert ppo["joint_steps_per_second"]["target"] is None

@@ -128,7 +128,7 @@ def _fitted(config: dict[str, Any], size: tuple[int, int], n_cases: int) -> dict
 
 
 def observation_bytes(config: Mapping[str, Any]) -> int:
-    """Return the bytes of the observations of a joint step: a team's maps are stored once.
+    """Return the bytes of the observations of a joint step at most: a team's maps are stored once.
 
     :param config: checked
     """
