@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from sb3_roles.baselines import CONTROLLER_NAMES
-from sb3_roles.zoo.bench_env import case_name, log_log_slope
+from sb3_roles.zoo.bench_env import case_name
+from sb3_roles.zoo.bench_report import log_log_slope
 from sb3_roles.zoo.options import key_value, parse_value
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -83,7 +84,6 @@ WRONG = [
     (["simulate", "--out", "/nowhere/x.parquet"], "sb3-roles simulate: error", "'/nowhere'"),
     (["simulate", "--render", "x.bmp"], "sb3-roles simulate: error", ".png"),
     (["simulate", "--render", "/nowhere/x.png"], "sb3-roles simulate: error", "'/nowhere'"),
-    (["bench"], "sb3-roles bench: error", "benchmark"),
     (["bench", "evn"], "sb3-roles bench: error", "did you mean 'env'?"),
     (["bench", "env", "--seconds-per-case", "0"], "sb3-roles bench env: error", "above 0"),
     (["bench", "env", "--seconds-per-case", "inf"], "sb3-roles bench env: error", "'inf'"),

@@ -22,19 +22,21 @@ from torch import nn
 from sb3_roles.common.policies import POSITION_KEY, STATE_KEY
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY, RoleWrapper
 from sb3_roles.common.team_wrapper import AGENT_KEY
-from sb3_roles.common.torch_layers import CHANNELS, MapEncoder, map_style
+from sb3_roles.common.torch_layers import make_map_encoder, map_style
 from sb3_roles.common.vectors import compressed, vector_size
 
 _NOT_SEEN = (STATE_KEY, POSITION_KEY, AGENT_KEY, ROLE_DUE_KEY)
 
 
 class OwnViewExtractor(BaseFeaturesExtractor):
-    """What one robot sees: maps through the paper's encoders, all else as it is.
+    """What one robot sees: maps through encoders, all else as it is.
 
     :param observation_space: flat Dict
+    :param encoder: see :func:`~sb3_roles.common.torch_layers.make_map_encoder`; by default the
+        paper's
     """
 
-    def __init__(self, observation_space: spaces.Dict) -> None:
+    def __init__(self, observation_space: spaces.Dict, encoder: str = "convolutions") -> None:
         encoders: dict[str, nn.Module] = {}
         size = 0
         for key, space in observation_space.spaces.items():
@@ -42,10 +44,9 @@ class OwnViewExtractor(BaseFeaturesExtractor):
             if key in _NOT_SEEN:
                 continue
             if len(shape) == 3:
-                style = map_style(key, shape)
-                encoder = MapEncoder(shape[0], style, CHANNELS[style])
-                encoders[key] = encoder
-                size += encoder.out_features
+                reader = make_map_encoder(encoder, map_style(key, shape), shape[0], None, "none")
+                encoders[key] = reader
+                size += reader.out_features
             else:
                 encoders[key] = nn.Flatten()
                 size += vector_size(space)
@@ -62,8 +63,8 @@ class OwnViewExtractor(BaseFeaturesExtractor):
         parts = []
         for key, encoder in self.encoders.items():
             part = encoder(observations[key].float())
-            is_map = isinstance(encoder, MapEncoder)
-            parts.append(part if is_map else compressed(boxes[key], part))
+            is_vector = isinstance(encoder, nn.Flatten)
+            parts.append(compressed(boxes[key], part) if is_vector else part)
         return th.cat(parts, dim=1)
 
 

@@ -11,10 +11,18 @@ import operator
 import statistics
 import tempfile
 from argparse import Namespace
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from sb3_roles.zoo.bench_report import against, cells, machine_lines, row, spread
+from sb3_roles.zoo.bench_report import (
+    against,
+    cells,
+    log_log_slope,
+    machine_lines,
+    plural,
+    ratios,
+    row,
+    spread,
+)
 from sb3_roles.zoo.env_cases import ROBOTS, SIDES, SUB_GOALS, Case, case_name, make_cases
 from sb3_roles.zoo.machine import describe_machine, fresh_python
 from sb3_roles.zoo.options import positive_number, whole_number
@@ -85,22 +93,40 @@ def run(args: Namespace) -> int:
     """
     machine = describe_machine()
     startup = measure_startup()
-    cases = make_cases()
-    for case in cases.values():
-        case.work()
-    for _ in range(args.repeats):
-        for case in cases.values():
-            case.measure(args.seconds_per_case)
+    cases = measure(make_cases(), args.seconds_per_case, args.repeats)
     report = {
         "config": {"seconds_per_case": args.seconds_per_case, "repeats": args.repeats},
         "machine": machine,
-        "cases": [_describe(case) for case in cases.values()],
-        "ratios": _ratios(cases),
+        **describe(cases),
         "growth": _growth(cases),
         **startup,
     }
     print(json.dumps(report, indent=2, allow_nan=False) if args.json else _table(report))
     return 0
+
+
+def measure(cases: dict[str, Case], seconds: float, repeats: int) -> dict[str, Case]:
+    """Measure cases in turn.
+
+    :param cases: by name
+    :param seconds: shortest measuring time of a case in a round
+    :param repeats: rounds
+    :return: the same cases
+    """
+    for case in cases.values():
+        case.work()
+    for _ in range(repeats):
+        for case in cases.values():
+            case.measure(seconds)
+    return cases
+
+
+def describe(cases: dict[str, Case]) -> dict[str, Any]:
+    """Return rates and their ratios, plain data.
+
+    :param cases: measured, those of 4 robots on 25 x 25 cells among them
+    """
+    return {"cases": [_describe(case) for case in cases.values()], "ratios": _ratios(cases)}
 
 
 def measure_startup(repeats: int = 3) -> dict[str, Any]:
@@ -147,12 +173,12 @@ def _describe(case: Case) -> dict[str, Any]:
 
 def _ratios(cases: dict[str, Case]) -> dict[str, dict[str, Any]]:
     fast = cases[case_name("native", "none", 4, 25)]
-    ratios = {}
+    found = {}
     for api in ("native_vec_env", "pettingzoo", "supersuit_vec_env", "reference"):
         slow = cases[case_name(api, "none", 4, 25)]
-        values = [a / b for a, b in zip(fast.rates, slow.rates, strict=True)]
-        ratios[f"native / {api}"] = against(spread(values), RATIO_TARGETS.get(api))
-    return ratios
+        values = spread(ratios(fast.rates, slow.rates))
+        found[f"native / {api}"] = against(values, RATIO_TARGETS.get(api))
+    return found
 
 
 def _growth(cases: dict[str, Case]) -> list[dict[str, Any]]:
@@ -176,18 +202,6 @@ def _growth(cases: dict[str, Case]) -> list[dict[str, Any]]:
     return growth
 
 
-def log_log_slope(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """Exponent b of the power law cost = a size^b that fits best in logarithms.
-
-    :param sizes: at least two different positive numbers
-    :param costs: as many positive numbers
-    :return: the exponent
-    """
-    import numpy as np
-
-    return float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])
-
-
 def _table(report: dict[str, Any]) -> str:
     config = report["config"]
     lines = [
@@ -198,8 +212,7 @@ def _table(report: dict[str, Any]) -> str:
     ]
     for case in report["cases"]:
         rate = case["joint_steps_per_second"]
-        teams = f"{case['n_teams']} team{'' if case['n_teams'] == 1 else 's'}"
-        label = f"{case['name']}, {teams}"
+        label = f"{case['name']}, {plural(case['n_teams'], 'team')}"
         lines.append(row(label, *cells(rate, ",.0f"), f"{case['cpu_share']:.2f}"))
     lines += ["", row("speed ratio, 4 robots 25x25", "median", "range", "target")]
     lines += [row(name, *cells(ratio, ",.1f")) for name, ratio in report["ratios"].items()]

@@ -10,7 +10,18 @@ from importlib.metadata import version
 from typing import Any
 
 from sb3_roles._version import __version__
+from sb3_roles.zoo.launcher import prepare_process, process_settings
 from sb3_roles.zoo.options import UsageError
+
+# Read by torch and what is below it when they are loaded.
+_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OMP_WAIT_POLICY",
+    "MKL_NUM_THREADS",
+    "GLIBC_TUNABLES",
+    "MALLOC_ARENA_MAX",
+    "LD_PRELOAD",
+)
 
 
 def usable_cores() -> int:
@@ -43,6 +54,33 @@ def describe_machine() -> dict[str, Any]:
         "numpy": version("numpy"),
         "numba": version("numba"),
         "sb3_roles": __version__,
+    }
+
+
+def start_torch(num_threads: int | None) -> dict[str, Any]:
+    """Import torch with the settings of ``train.py``, and describe the machine.
+
+    :param num_threads: threads of torch; None for its default
+    :return: see :func:`describe_machine`; also torch, and the settings of its threads
+    """
+    machine = describe_machine()
+    prepare_process()
+    import stable_baselines3
+    import torch as th
+
+    from sb3_roles.common.torch_layers import has_fast_bfloat16
+
+    if num_threads is not None:
+        th.set_num_threads(num_threads)
+    return {
+        **machine,
+        "torch": th.__version__,
+        "stable_baselines3": stable_baselines3.__version__,
+        "torch_threads": th.get_num_threads(),
+        "cpu_capability": th.backends.cpu.get_cpu_capability(),
+        "fast_bfloat16": has_fast_bfloat16(),
+        "process": process_settings(),
+        "environment": {name: os.environ[name] for name in _VARIABLES if name in os.environ},
     }
 
 
