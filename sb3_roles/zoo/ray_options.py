@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sb3_roles.zoo.algorithms import ALGORITHMS
@@ -93,10 +94,9 @@ def import_ray() -> ModuleType:
     :raises UsageError: if it is not installed
     """
     try:
-        from sb3_roles.common import ray_cluster
+        return import_module("sb3_roles.common.ray_cluster")
     except ImportError:
         raise UsageError("argument --ray: install sb3_roles[ray] to use it") from None
-    return ray_cluster
 
 
 @contextmanager
