@@ -56,8 +56,7 @@ format: $(STAMP) ## rewrite the code in the house format
 	$(BIN)/ruff format .
 
 bench: $(STAMP) ## measure the speed of the environment and of training
-	$(BIN)/sb3-roles bench env
-	$(BIN)/sb3-roles bench train
+	$(BIN)/sb3-roles bench
 
 clean: ## remove the virtual environment and all caches
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
