@@ -5,7 +5,8 @@ import torch as th
 from gnn_teams import SMALL, graphs_of, log_probs, make_policy, observation, played
 from helpers import collect, hand_made, one_line, record_logs, same, small_search, weights
 
-from sb3_roles import MAPPO
+from area_search import AreaSearchEnv
+from sb3_roles import MAPPO, make_team_vec_env
 from sb3_roles.common.distributions import LOG_ZERO
 from sb3_roles.gnn import GNNPolicy, H2GNNPolicy
 
@@ -181,6 +182,17 @@ def h2gnn(**options):
         policy_kwargs=SMALL,
         **options,
     )
+
+
+def test_a_critic_that_reads_patches_leaves_the_graph_its_maps():
+    env = make_team_vec_env(lambda: AreaSearchEnv("hard", known_map=True), n_envs=2, seed=0)
+    options = {**SMALL, "encoder": "patches", "norm_layer": "none"}
+    for name in ("joint_channels", "local_channels", "state_channels"):
+        options.pop(name, None)
+    model = MAPPO(H2GNNPolicy, env, n_steps=4, batch_size=4, policy_kwargs=options)
+    before = weights(model)
+    model.learn(4 * model.n_envs)
+    assert not same(weights(model), before)
 
 
 def test_learning_rate_0_leaves_the_ratio_at_1():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch as th
 from helpers import small_search
 
 from sb3_roles import HMAPPO, MAPPO
-from sb3_roles.common.shards import add_gradients, shards_of
+from sb3_roles.common.shards import add_gradients, set_gradients, shards_of, trainable
 from sb3_roles.common.threads import ThreadCrew
 
 CPU = th.device("cpu")
@@ -79,3 +81,32 @@ def test_gradients_are_added_and_what_none_depends_on_has_none():
     parts = [(th.ones(2), None, None), (th.ones(2), th.ones(1), None)]
     first, second, third = add_gradients(parts)
     assert first.tolist() == [2.0, 2.0] and second.tolist() == [1.0] and third is None
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_convolutions_get_their_own_gradients(fused):
+    th.manual_seed(0)
+    mine = th.nn.Conv2d(16, 32, 3, stride=2)
+    plain = copy.deepcopy(mine)
+    # As maps come out of the buffer, which moves the gradient of the weights about in memory.
+    maps = th.randn(8, 16, 9, 9).to(memory_format=th.channels_last)
+    parameters = trainable(mine)
+    gradients = th.autograd.grad(mine(maps).square().mean(), parameters)
+    assert any(g.stride() != p.stride() for g, p in zip(gradients, parameters, strict=True))
+    set_gradients(parameters, gradients)
+    plain(maps).square().mean().backward()
+    for module, options in ((mine, {"fused": fused}), (plain, {})):
+        th.optim.Adam(module.parameters(), lr=1e-2, **options).step()
+    for one, other in zip(mine.parameters(), plain.parameters(), strict=True):
+        th.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
+
+
+def test_what_is_frozen_stays_and_the_rest_learns():
+    model = HMAPPO("RolePolicy", small_search(), n_steps=4, batch_size=8, n_shards=2, device="cpu")
+    model.policy.encoders.requires_grad_(False)
+    before = {name: value.clone() for name, value in model.policy.named_parameters()}
+    model.learn(2 * 4 * model.n_envs)
+    for name, value in model.policy.named_parameters():
+        if name.startswith("encoders."):
+            assert th.equal(value, before[name])
+    assert not th.equal(model.policy.value_net.role.weight, before["value_net.role.weight"])

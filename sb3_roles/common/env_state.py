@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -79,7 +80,8 @@ def set_env_state(env: VecEnv, state: Mapping[str, Any]) -> None:
     if len(state["teams"]) != len(rows):
         raise ValueError("the environments' state is of another number of teams")
     for row, one in zip(rows, state["teams"], strict=True):
-        team_env.env_method("set_state", one, indices=row)
+        # A copy: what came from another process may be read-only, and an environment may keep it.
+        team_env.env_method("set_state", copy.deepcopy(one), indices=row)
     set_wrapper_states(env, state["wrappers"])
 
 

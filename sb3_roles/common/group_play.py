@@ -73,16 +73,21 @@ class GroupRecord(NamedTuple):
 
 
 def divide(
-    env: VecEnv, groups: Sequence[TeamGroup], observations: Observations, n_steps: int
+    env: VecEnv,
+    state: EnvState,
+    groups: Sequence[TeamGroup],
+    observations: Observations,
+    n_steps: int,
 ) -> list[GroupTask]:
     """Make the tasks of a rollout.
 
-    :param env: of all teams, whose state can be divided
+    :param env: of all teams
+    :param state: its state, which can be divided
     :param groups: in order
     :param observations: what the teams see
     :param n_steps: joint steps
     """
-    team_env, state = find_team_env(env), env_state(env)
+    team_env = find_team_env(env)
     return [
         GroupTask(
             group.teams.stop - group.teams.start,
@@ -227,10 +232,11 @@ class TaskPlayer(ABC):
 
         :raises ValueError: if the state of the environment can not be divided by teams
         """
-        gap = parts_gap(env, env_state(env))
+        state = env_state(env)
+        gap = parts_gap(env, state)
         if gap is not None:
             raise ValueError(gap)
-        tasks = divide(env, groups, observations, n_steps)
+        tasks = divide(env, state, groups, observations, n_steps)
         records = self.run(tasks, self._learner.policy.state_dict())
         last_values = np.concatenate([record.last_values for record in records])
         # Callbacks compute, too: on as many threads as where the rollout is played here.

@@ -31,3 +31,19 @@ def add_gradients(parts: Sequence[Gradients]) -> list[th.Tensor | None]:
                 before = total[k]
                 total[k] = gradient if before is None else before.add_(gradient)
     return total
+
+
+def trainable(module: th.nn.Module) -> list[th.nn.Parameter]:
+    """Return the parameters that are not frozen."""
+    return [parameter for parameter in module.parameters() if parameter.requires_grad]
+
+
+def set_gradients(parameters: Sequence[th.nn.Parameter], gradients: Gradients) -> None:
+    """Give each parameter its gradient, in the memory layout of the parameter.
+
+    Convolutions return theirs in another one, and a fused optimizer goes through both by address.
+    """
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        if gradient is not None and gradient.stride() != parameter.stride():
+            gradient = th.empty_like(parameter, requires_grad=False).copy_(gradient)
+        parameter.grad = gradient

@@ -20,6 +20,7 @@ from sb3_roles.common.checks import check_not_negative, check_positive, check_un
 from sb3_roles.common.distributions import LOG_ZERO
 from sb3_roles.common.names import one_line
 from sb3_roles.common.policies import TeamPolicy
+from sb3_roles.common.shards import trainable
 from sb3_roles.gnn.demonstrations import DemonstrationError
 from sb3_roles.gnn.joint_steps import JointSteps, batches, moved
 from sb3_roles.gnn.policies import GNNPolicy
@@ -262,8 +263,8 @@ class GNN(MAPPO):
             rate = self.learning_rate * self.lr_decay ** (self._n_updates // self.lr_decay_every)  # type: ignore[operator]
             update_learning_rate(self.policy.optimizer, rate)
             loss, accuracy = self._cross_entropy(*batch)
-            parameters = list(self.policy.parameters())
-            self._optimize(loss, th.autograd.grad(loss, parameters, allow_unused=True))
+            gradients = th.autograd.grad(loss, trainable(self.policy), allow_unused=True)
+            self._optimize(loss, gradients)
             self._n_updates += 1
             losses.append(loss.detach())
             right.append(accuracy)

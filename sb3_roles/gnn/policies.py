@@ -122,6 +122,9 @@ class GraphActorCriticPolicy(TeamActorCriticPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
+        for key in self.graph_keys:
+            # The graph is made from whole maps.
+            self._map_readers.pop(key, None)
         self.message_passing.balance()
 
     def _build_networks(self) -> None:

@@ -21,7 +21,13 @@ from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
 from sb3_roles.common.policies import TeamPolicy
 from sb3_roles.common.rollout_steps import LocalPlayer, RolloutPlayer
 from sb3_roles.common.rollouts import make_groups, split_teams
-from sb3_roles.common.shards import Gradients, add_gradients, shards_of
+from sb3_roles.common.shards import (
+    Gradients,
+    add_gradients,
+    set_gradients,
+    shards_of,
+    trainable,
+)
 from sb3_roles.common.team_wrapper import AGENT_KEY, TeamWrapper, find_team_env
 from sb3_roles.common.threads import ThreadCrew
 from sb3_roles.common.torch_layers import updating_statistics
@@ -308,7 +314,7 @@ class MAPPO(OnPolicyAlgorithm):
                 self.kl_coefs[s] = adapt_kl_coef(self.kl_coefs[s], kl, self.kl_target)
 
     def _too_far(self, losses: list[StreamLoss]) -> bool:
-        """Whether to stop the epochs; without a limit, a GPU is not waited for."""
+        """Whether to stop the epochs."""
         if self.target_kl is None:
             return False
         return sum(float(loss.kl) for loss in losses) > 1.5 * self.target_kl
@@ -319,11 +325,11 @@ class MAPPO(OnPolicyAlgorithm):
         """Compute the loss of a minibatch and its gradients, shard by shard.
 
         :param index: (time, team) pairs of the rollout
-        :return: per stream the loss, detached; per parameter the gradient
+        :return: per stream the loss, detached; per parameter that is not frozen the gradient
         """
         n_active = self.rollout_buffer.n_active(index)
         n_rows = len(index) * self.rollout_buffer.n_agents
-        parameters = list(self.policy.parameters())
+        parameters = trainable(self.policy)
 
         def of_shard(pairs: th.Tensor) -> tuple[list[StreamLoss], Gradients]:
             batch = self.rollout_buffer.samples(pairs)
@@ -372,8 +378,7 @@ class MAPPO(OnPolicyAlgorithm):
                 f"the loss is {loss.item()}: no step was taken; check rewards and observations, or "
                 "lower learning_rate"
             )
-        for parameter, gradient in zip(self.policy.parameters(), gradients, strict=True):
-            parameter.grad = gradient
+        set_gradients(trainable(self.policy), gradients)
         limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), limit)
         if not th.isfinite(norm):

@@ -14,7 +14,7 @@ from sb3_roles.zoo.options import UsageError, whole_number
 if TYPE_CHECKING:
     from types import ModuleType
 
-_LOCAL = "local"
+LOCAL = "local"
 _SPLITS = "rollout_groups"
 # Of observations of one rollout and their way back.
 _STORE_BYTES = 500_000_000
@@ -26,7 +26,7 @@ def add_ray_options(add: Callable[..., None]) -> None:
     :param add: ``add_argument`` of the command
     """
     add("--ray", metavar="ADDRESS", help="use a Ray cluster: its address, auto, or "
-        f"{_LOCAL!r} to start one here (extra ray). Several runs (--n-seeds, --algo, --vary) go "
+        f"{LOCAL!r} to start one here (extra ray). Several runs (--n-seeds, --algo, --vary) go "
         "side by side, each on --num-threads CPUs, in a log folder that all machines share; with "
         "--rollout-workers one run's rollouts are played there")  # fmt: skip
     add("--rollout-workers", type=whole_number(1, 1024), metavar="K", help="Ray tasks that play "
@@ -126,12 +126,13 @@ def rollouts_on_ray(
         raise UsageError("--rollout-workers act on CPUs, and so must the run: add --device cpu")
     from sb3_roles.common.snapshot import kept_rng
 
+    here = model.player
     with kept_rng():
         cluster = connected_to(options["ray"])
-        from sb3_roles.zoo.ray_rollouts import RayPlayer
-
-    here, model.player = model.player, RayPlayer(model, config, workers)
     try:
+        with kept_rng():
+            from sb3_roles.zoo.ray_rollouts import RayPlayer
+        model.player = RayPlayer(model, config, workers)
         yield
     finally:
         model.player = here

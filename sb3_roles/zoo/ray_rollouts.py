@@ -23,8 +23,9 @@ from sb3_roles.common.ray_cluster import ray
 from sb3_roles.common.rollout_steps import Learner
 from sb3_roles.common.snapshot import kept_rng
 
-# Losses of a worker or of its machine, however many; errors of an environment are none.
-MAX_RETRIES = -1
+# Losses of a worker or of its machine; errors of an environment are none. A task that ends its
+# worker every time must not be tried forever.
+MAX_RETRIES = 20
 
 
 class RayPlayer(TaskPlayer):

@@ -81,7 +81,7 @@ def run_on_ray(
     :param options: of the command
     :param n_threads: of torch, and CPUs of a run
     :return: the first exit code that is not 0, or 0
-    :raises UsageError: if no machine of the cluster has so many CPUs
+    :raises UsageError: if no machine of the cluster has so many CPUs, or the GPU
     """
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     largest = int(max((node.get("CPU", 0) for node in nodes), default=0))
@@ -91,6 +91,8 @@ def run_on_ray(
             f"has {largest}"
         )
     gpus = 1 if options["device"] == "cuda" else 0
+    if gpus and not any(node.get("GPU", 0) >= 1 for node in nodes):
+        raise UsageError("--device cuda: no machine of the cluster has a GPU")
     train = ray.remote(num_cpus=n_threads, num_gpus=gpus, max_retries=0)(train_run)
     running = [train.remote(run_arguments(arguments, run, n_threads), os.getcwd()) for run in runs]
     codes = []

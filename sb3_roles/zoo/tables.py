@@ -17,7 +17,7 @@ from sb3_roles.evaluation.report import PAGE
 from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
 from sb3_roles.zoo.machine import usable_cores
 from sb3_roles.zoo.options import UsageError, names_of, whole_number
-from sb3_roles.zoo.ray_options import import_ray
+from sb3_roles.zoo.ray_options import LOCAL, import_ray
 from sb3_roles.zoo.row_runs import LOGS, PLAN, config_of_row
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sb3_roles.zoo.table_outputs import Made
 
 EXIT_ROWS_FAILED = 3
-RECORDS, LOCAL = "records", "local"
+RECORDS = "records"
 _ABOUT = (
     "What was played once is kept in records, and only what is missing is played: a command that "
     "was interrupted goes on where it was. Learned rows are the runs of --log-folder with the "
