@@ -175,9 +175,5 @@ def join_states(env: VecEnv, parts: Sequence[Mapping[str, Any]]) -> EnvState:
         teams = [join_rows([part["teams"][0] for part in parts])]
     else:
         teams = [one for part in parts for one in part["teams"]]
-    return {"teams": teams, "wrappers": join_wrappers([part["wrappers"] for part in parts])}
-
-
-def join_wrappers(parts: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Put together the states of the wrappers of consecutive teams."""
-    return [join_rows(layer) for layer in zip(*parts, strict=True)]
+    layers = zip(*(part["wrappers"] for part in parts), strict=True)
+    return {"teams": teams, "wrappers": [join_rows(layer) for layer in layers]}

@@ -170,10 +170,10 @@ class TrainingCase:
     def _set_threads(self, number: int) -> None:
         import torch as th
 
+        from sb3_roles.zoo.models import step_on_threads
+
         th.set_num_threads(number)
-        # As make_env does.
-        if self.env.has_attr("n_threads"):
-            self.env.set_attr("n_threads", number)
+        step_on_threads(self.env, number)
 
     def repeat_update(self) -> tuple[float, Work]:
         """Update once more on the last rollout, apart from all that :meth:`describe` returns.

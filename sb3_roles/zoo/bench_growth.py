@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_roles.zoo.bench_case import TrainingCase, configure, training_case
 from sb3_roles.zoo.bench_memory import available_memory
-from sb3_roles.zoo.bench_report import Table, log_log_slope, machine_lines, plural, spread
+from sb3_roles.zoo.bench_report import (
+    Table,
+    log_log_slope,
+    machine_lines,
+    plural,
+    rounds_line,
+    spread,
+)
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
 from sb3_roles.zoo.env_cases import make_scene
 from sb3_roles.zoo.machine import start_torch
@@ -234,11 +241,9 @@ def _exponents(
 
 
 def _head(report: Mapping[str, Any]) -> list[str]:
-    config = report["config"]
     return [
         *machine_lines(report["machine"]),
-        f"{plural(config['repeats'], 'interleaved round')} of "
-        f"{plural(config['iterations'], 'iteration')}; microseconds per joint step, median",
+        f"{rounds_line(report['config'])}; microseconds per joint step, median",
     ]
 
 

@@ -12,8 +12,8 @@ from sb3_roles.zoo.bench_case import TrainingCase, configure, training_case
 from sb3_roles.zoo.bench_report import (
     Table,
     machine_lines,
-    plural,
     range_text,
+    rounds_line,
     spread,
 )
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
@@ -152,11 +152,10 @@ def _describe(
 
 
 def _head(report: Mapping[str, Any]) -> list[str]:
-    config, same = report["config"], report["same_as_default"]
+    same = report["same_as_default"]
     head = [
         *machine_lines(report["machine"]),
-        f"{plural(config['repeats'], 'interleaved round')} of "
-        f"{plural(config['iterations'], 'iteration')}",
+        rounds_line(report["config"]),
     ]
     return head + ([f"the default already: {', '.join(same)}"] if same else [])
 

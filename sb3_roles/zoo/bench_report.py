@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -123,6 +123,15 @@ def page(head: Sequence[str], tables: Sequence[Table], markdown: bool = False) -
     for table in tables:
         lines += ["", *table.lines(markdown)]
     return "\n".join(lines)
+
+
+def rounds_line(config: Mapping[str, Any]) -> str:
+    """Say how often was measured.
+
+    :param config: ``repeats`` and ``iterations``
+    """
+    rounds = plural(config["repeats"], "interleaved round")
+    return f"{rounds} of {plural(config['iterations'], 'iteration')}"
 
 
 def machine_lines(machine: dict[str, Any]) -> list[str]:

@@ -25,7 +25,7 @@ from sb3_roles.common.torch_layers import make_map_encoder, mlp
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.bench_case import TrainingCase
 from sb3_roles.zoo.environments import env_factory
-from sb3_roles.zoo.models import complete
+from sb3_roles.zoo.models import complete, step_on_threads
 
 
 class ViewAndState(BaseFeaturesExtractor):
@@ -108,8 +108,7 @@ def stock_case(name: str, config: Mapping[str, Any], backend: str) -> TrainingCa
     factory = env_factory(config["env"], config["env_kwargs"])
     # As SB3 takes it: what a team shares is repeated for each robot.
     venv = make_team_vec_env(factory, config["n_envs"], backend=backend)
-    if venv.has_attr("n_threads"):
-        venv.set_attr("n_threads", th.get_num_threads())
+    step_on_threads(venv, th.get_num_threads())
     env = RoleWrapper(venv, **config["wrapper_kwargs"])
     own = complete(config)["policy_kwargs"]
     arguments = ALGORITHMS["ppo"].arguments(config, env.n_agents)

@@ -21,7 +21,7 @@ from sb3_roles.zoo.bench_case import (
 )
 from sb3_roles.zoo.bench_compare import RIVALS, Comparison, comparison_table
 from sb3_roles.zoo.bench_memory import memory_cells, peak_memory
-from sb3_roles.zoo.bench_report import Table, cells, machine_lines, plural
+from sb3_roles.zoo.bench_report import Table, cells, machine_lines, rounds_line
 from sb3_roles.zoo.bench_rounds import add_round_options, print_report
 from sb3_roles.zoo.machine import start_torch
 from sb3_roles.zoo.options import UsageError, int_text, several_of
@@ -138,11 +138,10 @@ def measure(
 
 
 def _head(report: Mapping[str, Any]) -> list[str]:
-    config, peak = report["config"], report["peak_resident_bytes"]
+    peak = report["peak_resident_bytes"]
     head = [
         *machine_lines(report["machine"]),
-        f"{plural(config['repeats'], 'interleaved round')} of "
-        f"{plural(config['iterations'], 'iteration')}"
+        rounds_line(report["config"])
         + (", of slower rivals 1 iteration" if report["comparisons"] else ""),
     ]
     if peak is not None:

@@ -31,6 +31,16 @@ from sb3_roles.zoo.ranges import Range
 from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS
 
 
+def step_on_threads(env: VecEnv, n_threads: int) -> None:
+    """Let an environment step its teams on some threads, if it can.
+
+    :param env: possibly wrapped
+    :param n_threads: at least 1; no result depends on it
+    """
+    if env.has_attr("n_threads"):
+        env.set_attr("n_threads", n_threads)
+
+
 def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
     """Make the environment of a configuration, with its wrappers.
 
@@ -49,8 +59,7 @@ def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
             backend=config["vec_env"],
             expand_team_observations=not algorithm.whole_teams,
         )
-        if venv.has_attr("n_threads"):
-            venv.set_attr("n_threads", th.get_num_threads())
+        step_on_threads(venv, th.get_num_threads())
         if algorithm.wrapper == "team":
             return TeamWrapper(venv)
         roles = RoleWrapper(venv, **config["wrapper_kwargs"])
