@@ -65,7 +65,7 @@ class ReferenceAreaSearch:
     :param scene: the task
     :param seed: seed of the stream
     :param episode: number of the episode in the stream
-    :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the team's map, too
     """
 
