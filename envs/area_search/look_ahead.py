@@ -155,9 +155,9 @@ def make_marks(area: int) -> Marks:
 
 def make_labels(area: int) -> Labels:
     """Allocate the labels of a search on a map; ``area`` padded cells."""
-    # A layer holds no cell twice and none that cannot be reached by then; behind the last layer
-    # that looks for more, a cell is labeled once at most.
-    capacity = area + sum(min(area, 2 * t * (t + 1) + 1) for t in range(DEPTH + 1))
+    # A layer holds no cell twice and none that cannot be reached by then; behind DEPTH, a cell is
+    # labeled once at most while nothing is found, and the layer in which something is ends it.
+    capacity = 2 * area + sum(min(area, 2 * t * (t + 1) + 1) for t in range(DEPTH + 1))
     return Labels(
         np.zeros(capacity, np.int32),
         np.zeros(capacity, np.int64),
@@ -282,7 +282,7 @@ def _search(
     """Search for the best route of one robot, layer by layer; a layer is a step.
 
     A route that comes to a cell with no more than another had there, at that time or before, is
-    given up, and so is one that comes to a cell of its own with anything to gain.
+    given up, and so is one that falls far behind the best. Nothing is gained twice in one cell.
 
     :param target: worth of a target
     :param sees: whether unseen cells are worth anything
@@ -336,7 +336,10 @@ def _search(
                     while own >= 0 and cell_of[own] != cell:
                         own = parent_of[own]
                     if own >= 0:
-                        continue
+                        # It got what there is when it came by before.
+                        value = before
+                        if value <= best[cell]:
+                            continue
                 first = np.uint8(1 << action) if t == 1 else first_of[k]
                 if value == best[cell]:
                     first_of[here] |= first
