@@ -45,8 +45,8 @@ def observation_space(scene: Scene, sub_goal: str = "none", known_map: bool = Fa
     :param known_map: with the key ``known``
     :return: flat Dict of ``local`` uint8 (4, side, side), ``joint`` uint8 (2, height, width),
         ``position`` float32 (2,), ``state`` uint8 (5, height, width); unless ``sub_goal`` is
-        ``"none"``, ``sub_goal`` float32 (2, 6), (2, 11) or (3, 11); with ``known_map``, ``known`` uint8
-        (2, height, width)
+        ``"none"``, ``sub_goal`` float32 (2, 6), (2, 11) or (3, 11); with ``known_map``, ``known``
+        uint8 (2, height, width)
     :raises ValueError: if ``sub_goal`` is unknown
     """
     if sub_goal not in paths.SUB_GOALS:

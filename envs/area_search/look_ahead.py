@@ -29,7 +29,7 @@ from area_search.cells import (
 from area_search.paths import encode
 from area_search.scenes import Scene
 
-DEPTH = 12
+DEPTH = 10
 """Steps that a route looks ahead; farther only to what is worth something at all."""
 DISCOUNT = 0.75
 """What a step later costs: far plans are never carried out, because the map grows meanwhile."""
@@ -38,13 +38,17 @@ CHANCES = (0.82, 0.55, 0.1, 0.02, 0.0)
 
 Measured on teams of ``greedy_assigned`` in the paper's scenes, which differ in that by 0.03.
 """
-SLACK = 2
+SLACK = 1.5
 """A route that is behind the best by this many targets at the present discount is given up."""
+FIRM = 5
+"""A robot plans again if a team mate is to get what it would have got within this many steps."""
 ROUNDS = 2
+"""Times that a robot plans at most, for the team to agree."""
 
 _WORTH_BITS, _DISCOUNT_BITS = 10, 20
 TARGET_WORTH = 1 << _WORTH_BITS
 WORTH_SCALE = float(1 << (_WORTH_BITS + _DISCOUNT_BITS))
+_SLACK_WORTH = int(SLACK * TARGET_WORTH)
 _NONE = -1
 _KNOWN_FREE = EXPLORED
 _KNOWN = EXPLORED | OBSTACLE
@@ -74,7 +78,8 @@ class Marks(NamedTuple):
     ``sight`` int64 (n,), the worth of the unseen cells in a cell's disc, -1 while not known;
     ``unseen`` int64 (n,), worth of an unseen cell + 1, 0 while not known; ``noted`` int32 (2, n),
     the cells of either that are known, their number int64 (2,) in ``n_noted``; ``claims``
-    int64 (n,), the discount at which a team mate gets a cell.
+    int64 (n,), the best discount at which a robot's route gets a cell, 0 for none, and ``claimant``
+    int32 (n,), whose route that is.
     """
 
     sight: np.ndarray
@@ -107,7 +112,8 @@ class Routes(NamedTuple):
 
     ``cells`` int32 (n_agents, n), ``lengths`` int64 (n_agents,), ``first`` uint8 (n_agents,), the
     actions that a route may begin with, as bits; ``worth`` int64 (n_agents, 5), by first action
-    that of the best route found; ``begin`` int64 (n_agents,), steps until a route gets anything.
+    that of the best route found; ``begin`` int64 (n_agents,), steps until a route gets anything;
+    ``robbed`` bool (n_agents,): a team mate's route gets what this one was to get before long.
     """
 
     cells: np.ndarray
@@ -221,40 +227,34 @@ def forget(marks: Marks) -> None:
 
 @njit(cache=True, inline="always")
 def _claim_cell(
-    i: int, cell: int, discount: int, claims: np.ndarray, claimant: np.ndarray, robbed: np.ndarray
+    i: int, cell: int, discount: int, firm: int, marks: Marks, robbed: np.ndarray
 ) -> None:
+    claims = marks.claims
     if claims[cell] < discount:
-        # Who was to get it later gets less now.
-        if claims[cell] > 0 and claimant[cell] != i:
-            robbed[claimant[cell]] = True
-        claims[cell], claimant[cell] = discount, i
+        # Who was to get it before long has to look for something else.
+        if claims[cell] >= firm and marks.claimant[cell] != i:
+            robbed[marks.claimant[cell]] = True
+        claims[cell], marks.claimant[cell] = discount, i
 
 
 @njit(cache=True)
 def _claim(
-    flat: np.ndarray,
-    i: int,
-    target: int,
-    sees: bool,
-    discounts: np.ndarray,
-    disc: np.ndarray,
-    routes: Routes,
-    marks: Marks,
+    cells: np.ndarray, i: int, target: int, sees: bool, rules: Rules, routes: Routes, marks: Marks
 ) -> None:
     """Claim for a robot what its route gets, with the discount at which it gets it."""
-    last = discounts.shape[0] - 1
-    cells, claims, claimant, robbed = routes.cells, marks.claims, marks.claimant, routes.robbed
-    sight, unseen = marks.sight, marks.unseen
+    discounts, disc = rules.discounts, rules.disc
+    last, firm = discounts.shape[0] - 1, discounts[FIRM]
+    route, robbed, sight, unseen = routes.cells, routes.robbed, marks.sight, marks.unseen
     for k in range(routes.lengths[i]):
-        cell = cells[i, k]
+        cell = route[i, k]
         discount = discounts[min(k + 1, last)]
-        if target > 0 and flat[cell] & KNOWN_TARGET:
-            _claim_cell(i, cell, discount, claims, claimant, robbed)
+        if target > 0 and cells[cell] & KNOWN_TARGET:
+            _claim_cell(i, cell, discount, firm, marks, robbed)
         if sees and sight[cell] > 0:
             for q in range(disc.shape[0]):
                 seen = cell + disc[q]
                 if unseen[seen] > 0:
-                    _claim_cell(i, seen, discount, claims, claimant, robbed)
+                    _claim_cell(i, seen, discount, firm, marks, robbed)
 
 
 @njit(cache=True)
@@ -300,7 +300,7 @@ def _search(
     while low < high and (t < DEPTH or top_value == 0):
         t += 1
         discount = discounts[min(t, last)]
-        hopeless = top_value - SLACK * TARGET_WORTH * discount
+        hopeless = top_value - _SLACK_WORTH * discount
         end = high
         for k in range(low, high):
             before = value_of[k]
@@ -417,13 +417,13 @@ def plan_routes(
                 _release(j, sees, rules.disc, routes, marks)
             for j in range(n_agents):
                 if j != i:
-                    _claim(cells, j, target, sees, rules.discounts, rules.disc, routes, marks)
+                    _claim(cells, j, target, sees, rules, routes, marks)
         routes.robbed[i] = False
         n_labels, top = _search(cells, starts[i], target, sees, 1, rules, marks, labels)
         if top == 0:
             n_labels, top = _search(cells, starts[i], target, sees, 0, rules, marks, labels)
         _keep(i, n_labels, top, labels, routes)
-        _claim(cells, i, target, sees, rules.discounts, rules.disc, routes, marks)
+        _claim(cells, i, target, sees, rules, routes, marks)
     for j in range(n_agents):
         _release(j, sees, rules.disc, routes, marks)
 

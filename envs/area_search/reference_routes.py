@@ -81,7 +81,7 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
     best, top, t = {start: 0}, labels[0], 0
     while layer and (t < look_ahead.DEPTH or top.value == 0):
         t += 1
-        hopeless = top.value - look_ahead.SLACK * _UNIT * discount(t)
+        hopeless = top.value - int(look_ahead.SLACK * _UNIT) * discount(t)
         following: dict[Cell, Label] = {}
         for label in layer:
             if label.value < hopeless:
@@ -149,7 +149,7 @@ class TeamRoutes:
             ):
                 owned, owner = claims.get(got, (0, i))
                 if owned < discount(t):
-                    if owner != i:
+                    if owner != i and owned >= discount(look_ahead.FIRM):
                         self.robbed.add(owner)
                     claims[got] = (discount(t), i)
 
@@ -173,4 +173,6 @@ def route_features(known: TeamMap, robots: list[Cell]) -> np.ndarray:
 
 def _nearness(distance: int) -> float:
     """0.9 ** distance, in fixed point."""
-    return round(float(np.float64(0.9) ** distance) * (1 << 32)) / (1 << 32) if distance < 212 else 0
+    return (
+        round(float(np.float64(0.9) ** distance) * (1 << 32)) / (1 << 32) if distance < 212 else 0
+    )

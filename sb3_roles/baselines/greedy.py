@@ -144,6 +144,7 @@ class GreedyAssignedController(Walker):
 
 @njit(cache=True)
 def random_bits(key: np.ndarray, episode: int, counter: int) -> int:
+    """Draw 63 bits that depend on the episode and a counter alone."""
     first = mix(key[0] ^ _TAG)
     word = draw(first, mix(episode_key(key, episode) ^ _TAG), np.uint64(counter))
     return int(np.int64(word >> np.uint64(1)))
