@@ -387,7 +387,7 @@ def test_bench_env_measures_everything():
     assert report["config"] == {"seconds_per_case": 0.001, "repeats": 2}
     assert set(report["machine"]) >= {"cpu", "cores", "load_before", "python", "numpy", "numba"}
     cases = {case["name"]: case for case in report["cases"]}
-    for sub_goal in ("none", "nearest", "assigned"):
+    for sub_goal in ("none", "nearest", "assigned", "routes"):
         for n_agents in (4, 15):
             for side in (25, 100):
                 assert case_name("native", sub_goal, n_agents, side) in cases
@@ -402,13 +402,13 @@ def test_bench_env_measures_everything():
     assert sum(case["joint_steps_per_second"]["met"] is not None for case in cases.values()) == 4
     assert {(line["sub_goal"], line["along"]) for line in report["growth"]} == {
         (sub_goal, along)
-        for sub_goal in ("none", "nearest", "assigned")
+        for sub_goal in ("none", "nearest", "assigned", "routes")
         for along in ("robots", "cells")
     }
     for line in report["growth"]:
         assert len(line["sizes"]) == len(line["microseconds"]) == 4
         assert isinstance(line["exponent"]["met"], bool)
-    assert set(report["compile"]["added"]) == {"none", "nearest", "assigned"}
+    assert set(report["compile"]["added"]) == {"none", "nearest", "assigned", "routes"}
     total = report["compile"]["total"]
     assert total["seconds"] == pytest.approx(sum(report["compile"]["added"].values()))
     assert all(times["median"] > 0 for times in report["imports"].values())

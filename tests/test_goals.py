@@ -35,6 +35,20 @@ def test_a_role_weighs_its_own_sub_goal_and_those_of_others():
     th.testing.assert_close(gain[:, COVER], th.full((12,), 0.5))
 
 
+def test_rows_behind_those_of_the_roles_count_for_every_role():
+    env = small_search(8, sub_goal="routes", roles={})
+    options = {"goal_key": "sub_goal", "goal_prior": 3.0, "shared_goal_prior": 0.25}
+    model = HMAPPO("RolePolicy", env, n_steps=10, batch_size=16, seed=0, policy_kwargs=options)
+    weights = model.policy.goal_net.weights.detach()
+    expected = th.tensor([[3.0, 1.0, 0.25], [1.0, 3.0, 0.25]])
+    th.testing.assert_close(weights.cpu(), expected)
+    model.learn(8 * 3 * 10)
+    moved = (model.policy.goal_net.weights.detach().cpu() - expected).abs()
+    # Each role has learned for itself what the shared row is worth.
+    assert moved[:, 2].min() > 1e-6
+    assert moved[0, 2] != moved[1, 2]
+
+
 def test_one_role_and_all_roles_are_the_same_function():
     policy = make_policy("hmappo", goal_key="sub_goal", goal_prior=1.5)
     obs = make_observation(3, 4)

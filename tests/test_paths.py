@@ -150,6 +150,8 @@ def test_widths_of_the_features() -> None:
     for sub_goal, width in (("nearest", 6), ("assigned", 11)):
         batch = hand_made(["#####", "#0.1#"], sub_goal=sub_goal)
         assert batch.observations["sub_goal"].shape == (1, 2, 2, width)
+    batch = hand_made(["#####", "#0.1#"], sub_goal="routes")
+    assert batch.observations["sub_goal"].shape == (1, 2, 3, 11)
     assert "sub_goal" not in hand_made(["#####", "#0.1#"]).observations
 
 

@@ -41,12 +41,12 @@ def observation_space(scene: Scene, sub_goal: str = "none", known_map: bool = Fa
     """Return one robot's observation space; no shape depends on the number of robots.
 
     :param scene: the task
-    :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: with the key ``known``
     :return: flat Dict of ``local`` uint8 (4, side, side), ``joint`` uint8 (2, height, width),
         ``position`` float32 (2,), ``state`` uint8 (5, height, width); unless ``sub_goal`` is
-        ``"none"``, ``sub_goal`` float32 (2, 6) or (2, 11); with ``known_map``, ``known`` uint8
-        (2, height, width)
+        ``"none"``, ``sub_goal`` float32 (2, 6), (2, 11) or (3, 11); with ``known_map``, ``known``
+        uint8 (2, height, width)
     :raises ValueError: if ``sub_goal`` is unknown
     """
     if sub_goal not in paths.SUB_GOALS:
@@ -61,7 +61,7 @@ def observation_space(scene: Scene, sub_goal: str = "none", known_map: bool = Fa
         "state": spaces.Box(0, 1, (len(layout.STATE_CHANNELS), *size), np.uint8),
     }
     if sub_goal != "none":
-        high = np.full((len(paths.GOAL_SETS), paths.sub_goal_width(sub_goal)), np.inf, np.float32)
+        high = np.full(paths.sub_goal_shape(sub_goal), np.inf, np.float32)
         high[:, : N_ACTIONS + 1] = 1.0
         boxes["sub_goal"] = spaces.Box(np.zeros_like(high), high, high.shape, np.float32)
     if known_map:
@@ -74,7 +74,7 @@ class TeamArrays:
 
     :param scene: the task
     :param n_teams: number of teams
-    :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the key ``known``, too
     :param n_threads: see :attr:`n_threads`
     """

@@ -41,7 +41,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
       ``early_stop_patience`` all are terminated once one of them has found nothing for long.
 
     :param scene: a :class:`Scene` or the name of one
-    :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the team's map, too
     :param render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a pygame window)
     :param scene_options: fields of the scene to change, such as ``n_agents=8``

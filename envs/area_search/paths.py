@@ -21,7 +21,7 @@ from area_search.cells import (
 )
 
 GOAL_SETS = ("frontier", "target")
-SUB_GOALS = ("none", "nearest", "assigned")
+SUB_GOALS = ("none", "nearest", "assigned", "routes")
 SUB_GOAL_DISCOUNT = 0.9
 
 # Discounted distances are summed as integers, so that a sum does not depend on its order.
@@ -29,9 +29,14 @@ _SCALE_BITS = 32
 SCALE = float(1 << _SCALE_BITS)
 
 
-def sub_goal_width(sub_goal: str) -> int:
-    """Features per goal set: first moves and nearness, and with "assigned" the territory."""
-    return {"none": 0, "nearest": N_ACTIONS + 1, "assigned": 2 * N_ACTIONS + 1}[sub_goal]
+def sub_goal_shape(sub_goal: str) -> tuple[int, int]:
+    """Rows and columns of a robot's path features.
+
+    A row per goal set, and with "routes" one for the robot's route; in columns first moves and
+    nearness, and unless it is "nearest" what there is to gain by first move.
+    """
+    rows = len(GOAL_SETS) + (sub_goal == "routes")
+    return rows, N_ACTIONS + 1 + (sub_goal != "nearest") * N_ACTIONS
 
 
 def discount_table() -> np.ndarray:
@@ -51,7 +56,7 @@ def search_scratch(sub_goal: str, n_agents: int, area: int) -> tuple[np.ndarray,
     :param area: cells of a padded map
     :return: the arguments from ``table`` up to ``out``
     """
-    searches = n_agents if sub_goal == "assigned" else 1
+    searches = 1 if sub_goal == "nearest" else n_agents
     common = (
         discount_table(),
         np.zeros((searches, area), np.int32),  # distance

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from area_search.random_streams import seed_key
+from area_search.reference_routes import TeamMap, route_features
 from area_search.scenes import Scene
 
 Cell = tuple[int, int]
@@ -65,7 +66,7 @@ class ReferenceAreaSearch:
     :param scene: the task
     :param seed: seed of the stream
     :param episode: number of the episode in the stream
-    :param sub_goal: ``"none"``, ``"nearest"`` or ``"assigned"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the team's map, too
     """
 
@@ -291,7 +292,13 @@ class ReferenceAreaSearch:
         ground = self.explored & self.free
         distances = [self._distances(robot, ground) for robot in self.robots]
         width = 6 if self.sub_goal == "nearest" else 11
-        out = np.zeros((len(self.robots), 2, width), np.float32)
+        rows = 3 if self.sub_goal == "routes" else 2
+        out = np.zeros((len(self.robots), rows, width), np.float32)
+        if self.sub_goal == "routes":
+            unexplored = set(self.all_cells) - self.explored
+            density = self.scene.n_targets / self.scene.n_free
+            team_map = TeamMap(ground, known, unexplored, self.disc, density)
+            out[:, 2] = route_features(team_map, self.robots)
         for k, goals in enumerate((frontier, known)):
             if self.sub_goal == "nearest":
                 chosen = [_nearest(goals, near) for near in distances]
@@ -302,7 +309,7 @@ class ReferenceAreaSearch:
                     flags = self._first_moves(robot, goal, ground)
                     out[i, k, :5] = np.maximum(out[i, k, :5], flags)
                     out[i, k, 5] = _worth(distances[i][goal]) / _SCALE
-                if self.sub_goal == "assigned":
+                if self.sub_goal != "nearest":
                     out[i, k, 6:] = self._territory(i, goals, distances, ground)
         return out
 

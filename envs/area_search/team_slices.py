@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from area_search import assignment, kernels, paths
+from area_search import assignment, kernels, look_ahead, paths
 from area_search import cells as layout
 
 if TYPE_CHECKING:
@@ -116,6 +116,7 @@ class TeamSlice:
             "none": None,
             "nearest": paths.nearest_sub_goals,
             "assigned": assignment.assigned_sub_goals,
+            "routes": assignment.assigned_sub_goals,
         }[arrays.sub_goal]
         if self._sub_goal_kernel is not None:
             scratch = paths.search_scratch(arrays.sub_goal, arrays.n_agents, cells[0].size)
@@ -126,6 +127,21 @@ class TeamSlice:
                 position,
                 goals,
                 *scratch,
+                out,
+            )
+        self._route_arguments: tuple[Any, ...] = ()
+        if arrays.sub_goal == "routes":
+            area, stride = cells[0].size, cells.shape[2]
+            self._route_arguments = (
+                cells,
+                border,
+                position,
+                look_ahead.make_rules(scene, stride),
+                look_ahead.make_marks(area),
+                look_ahead.make_labels(area),
+                look_ahead.make_routes(arrays.n_agents, area),
+                np.zeros(arrays.n_agents, np.int64),  # starts
+                paths.discount_table(),
                 out,
             )
 
@@ -154,6 +170,8 @@ class TeamSlice:
             kernels.observe_known(mine, *self._known_arguments)
         if self._sub_goal_kernel is not None:
             self._sub_goal_kernel(mine, *self._sub_goal_arguments)
+        if self._route_arguments:
+            look_ahead.route_goals(mine, *self._route_arguments)
 
 
 class SliceThreads:

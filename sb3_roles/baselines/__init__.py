@@ -15,6 +15,7 @@ _HOME = {
     "random": "sb3_roles.baselines.random:RandomController",
     "greedy": "sb3_roles.baselines.greedy:GreedyController",
     "greedy_assigned": "sb3_roles.baselines.greedy:GreedyAssignedController",
+    "look_ahead": "sb3_roles.baselines.look_ahead:LookAheadController",
     "vrpc": "sb3_roles.baselines.vrpc:VRPController",
     "planner": "sb3_roles.baselines.vrpc:RoutePlanner",
     "oracle": "sb3_roles.baselines.oracle:OracleController",

@@ -53,7 +53,7 @@ _TAG = np.uint64(0x4752454544592121)  # "GREEDY!!"
 _HALF = 32
 
 
-class _Walker(ScriptedController):
+class Walker(ScriptedController):
     """Calls a kernel that walks, with the teams' maps and what the controller keeps."""
 
     def begin(self, batch: BatchedAreaSearch) -> None:
@@ -93,7 +93,7 @@ class _Walker(ScriptedController):
         return actions
 
 
-class GreedyController(_Walker):
+class GreedyController(Walker):
     """Every robot for itself: the nearest goal, then the next.
 
     A robot picks the nearest frontier cell or known uncovered target, a target first on a tie, and
@@ -116,7 +116,7 @@ class GreedyController(_Walker):
         _walk_alone(*arguments)
 
 
-class GreedyAssignedController(_Walker):
+class GreedyAssignedController(Walker):
     """The team shares its goals out one to one, anew at each step.
 
     Robots and goals are matched nearest pair first. A target counts as ``TARGET_LEAD`` cells nearer
@@ -143,14 +143,15 @@ class GreedyAssignedController(_Walker):
 
 
 @njit(cache=True)
-def _random_bits(key: np.ndarray, episode: int, counter: int) -> int:
+def random_bits(key: np.ndarray, episode: int, counter: int) -> int:
+    """Draw 63 bits that depend on the episode and a counter alone."""
     first = mix(key[0] ^ _TAG)
     word = draw(first, mix(episode_key(key, episode) ^ _TAG), np.uint64(counter))
     return int(np.int64(word >> np.uint64(1)))
 
 
 @njit(cache=True)
-def _first_move(moves: int, heading: int, bits: int) -> int:
+def first_move(moves: int, heading: int, bits: int) -> int:
     """Choose among the first moves of the shortest paths: straight on, else any."""
     if (moves >> heading) & 1:
         return heading
@@ -193,7 +194,7 @@ def _walk_alone(
         flat = cells[m].reshape(-1)
         nothing = count_goals(flat, _GOALS) == 0
         for i in range(n_agents):
-            bits = _random_bits(keys[m], episodes[m], steps[m] * n_agents + i)
+            bits = random_bits(keys[m], episodes[m], steps[m] * n_agents + i)
             salt = 1 + (bits >> _HALF)
             start = (position[m, i, 0] + border) * stride + position[m, i, 1] + border
             best = goal[m, i]
@@ -221,7 +222,7 @@ def _walk_alone(
             action = 0
             if best != _NO_GOAL:
                 wanted[m, i] = KNOWN_TARGET if flat[best] & KNOWN_TARGET else FRONTIER
-                action = _first_move(moves[best], heading[m, i], bits)
+                action = first_move(moves[best], heading[m, i], bits)
             heading[m, i] = actions[m, i] = action
             for k in range(tail):
                 moves[queue[k]] = 0
@@ -266,7 +267,7 @@ def _walk_assigned(
                 ends[i, LISTED] = ends[i, CURSOR] = 0
         n_goals = count_goals(flat, _GOALS)
         counter = steps[m] * (n_agents + 1)
-        salt = 1 + (_random_bits(keys[m], episodes[m], counter) >> _HALF)
+        salt = 1 + (random_bits(keys[m], episodes[m], counter) >> _HALF)
         assign(
             flat,
             stride,
@@ -305,8 +306,8 @@ def _walk_assigned(
                     blocked,
                 )
             if goal != NOBODY:
-                bits = _random_bits(keys[m], episodes[m], counter + 1 + i)
-                action = _first_move(moves[s, goal], heading[m, i], bits)
+                bits = random_bits(keys[m], episodes[m], counter + 1 + i)
+                action = first_move(moves[s, goal], heading[m, i], bits)
             heading[m, i] = actions[m, i] = action
         for i in range(n_agents):
             if source[i] == i:

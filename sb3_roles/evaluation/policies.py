@@ -261,8 +261,7 @@ def _draw_uniforms(
 def _sub_goal_of(known: Mapping[str, spaces.Space]) -> str:
     if "sub_goal" not in known:
         return "none"
-    width = (known["sub_goal"].shape or (0,))[-1]
     for name in paths.SUB_GOALS:
-        if name != "none" and paths.sub_goal_width(name) == width:
+        if name != "none" and paths.sub_goal_shape(name) == known["sub_goal"].shape:
             return name
     return "none"  # The key of some other environment.

@@ -42,10 +42,13 @@ class RoleActorCriticPolicy(TeamPolicy):
     :param primitive_arch: hidden layers of the primitive actor
     :param goal_key: observation key with one row per role that begins with flags of the moves
         towards that role's sub-goal, such as area search's ``sub_goal`` (the sub-goals of the
-        paper's GA-POMDP, Section IV); None for no such logits
+        paper's GA-POMDP, Section IV); rows behind these belong to no role, such as the route's with
+        ``sub_goal="routes"``; None for no such logits
     :param goal_prior: first weight, learned from there on, of the flags of a robot's own role in
         the moves' logits: above 0, an untrained robot heads for the sub-goal of its role
     :param other_goal_prior: the same for the flags of the other roles
+    :param shared_goal_prior: the same for the flags of rows that belong to no role, with a weight
+        that each role learns for itself
     :param value_arch: hidden layers of both critics
     :param see_role: give the role that is going on to the role actor and the critics; for roles
         that last several steps
@@ -69,6 +72,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         goal_key: str | None = None,
         goal_prior: float = 2.0,
         other_goal_prior: float = 1.0,
+        shared_goal_prior: float = 2.0,
         value_arch: Sequence[int] = (64, 32),
         see_role: bool = False,
         **options: Any,
@@ -93,6 +97,7 @@ class RoleActorCriticPolicy(TeamPolicy):
         self.goal_key = goal_key
         self.goal_prior = goal_prior
         self.other_goal_prior = other_goal_prior
+        self.shared_goal_prior = shared_goal_prior
         self.value_arch = tuple(value_arch)
         self.see_role = see_role
         self.n_roles, self.n_moves = (int(n) for n in action_space.nvec)  # type: ignore[attr-defined]
@@ -108,6 +113,7 @@ class RoleActorCriticPolicy(TeamPolicy):
             "goal_key",
             "goal_prior",
             "other_goal_prior",
+            "shared_goal_prior",
             "value_arch",
             "see_role",
         )
@@ -149,13 +155,15 @@ class RoleActorCriticPolicy(TeamPolicy):
         n_goals = self._count_goals(self.goal_key, self.n_moves)
         if not n_goals:
             return None
-        if n_goals != self.n_roles:
+        if n_goals < self.n_roles:
             raise ValueError(
                 f"goal_key {self.goal_key!r} must have one row for each of the {self.n_roles} "
                 f"roles, got {n_goals} rows"
             )
         own = th.eye(self.n_roles)
         weights = own * self.goal_prior + (1.0 - own) * self.other_goal_prior
+        shared = th.full((self.n_roles, n_goals - self.n_roles), self.shared_goal_prior)
+        weights = th.cat([weights, shared], dim=1)
         return GoalPrior(weights, self.n_moves)
 
     def _move_log_probs(

@@ -102,6 +102,7 @@ POLICY_ARGUMENTS: dict[str, dict[str, Range]] = {
         "see_role": Flag(),
         **_GOALS,
         "other_goal_prior": Number(0.0, 100.0),
+        "shared_goal_prior": Number(0.0, 100.0),
     },
     "RowPolicy": {"net_arch": _WIDTHS, "optimizer_kwargs": _OPTIMIZER},
     "RecurrentRowPolicy": {

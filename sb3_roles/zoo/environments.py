@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 AREA_SEARCH = "area-search-v0"
 ENVIRONMENTS: dict[str, str] = {AREA_SEARCH: "area_search:AreaSearchEnv"}
 # area_search has both lists, behind numba, which takes a second to import.
-SUB_GOALS = ("none", "nearest", "assigned")
+SUB_GOALS = ("none", "nearest", "assigned", "routes")
 GOAL_SETS = ("frontier", "target")
 REWARD_COMPONENTS = ("explore", "cover")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")

@@ -1,0 +1,178 @@
+"""The joint look-ahead once more, in plain Python: slow, with sets, and independent of the kernels.
+
+The tests hold ``area_search.look_ahead`` to it bit for bit. It shares with it only its constants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+
+from area_search import look_ahead
+
+Cell = tuple[int, int]
+MOVES: tuple[Cell, ...] = ((0, 0), (-1, 0), (0, 1), (1, 0), (0, -1))
+_UNIT = 1 << 10
+_FINEST = 1 << 20
+
+
+@cache
+def discount(steps: int) -> int:
+    """What is left of a worth after some steps, in fixed point, never nothing."""
+    return max(1, round(float(np.float64(look_ahead.DISCOUNT) ** steps) * _FINEST))
+
+
+@dataclass
+class Label:
+    """A partial route: its cells from the start on, what it is worth, how it may begin."""
+
+    path: list[Cell]
+    value: int = 0
+    first: set[int] = field(default_factory=set)
+    begin: int = 0
+
+
+@dataclass
+class TeamMap:
+    """What a team knows, and what that is worth.
+
+    :param ground: known free cells
+    :param targets: known uncovered targets
+    :param unexplored: cells of the map that nobody has seen
+    :param disc: the cells of the map that a robot senses from a cell
+    :param density: expected targets per free cell
+    """
+
+    ground: set[Cell]
+    targets: set[Cell]
+    unexplored: set[Cell]
+    disc: Callable[[Cell], set[Cell]]
+    density: float
+    known_gains: dict[tuple[Cell, Cell], dict[Cell, int]] = field(default_factory=dict)
+
+    def unseen_worth(self, cell: Cell) -> int:
+        """Return the worth of an unseen cell; off the map all is known to be obstacles."""
+        beside = [(cell[0] + dr, cell[1] + dc) for dr, dc in MOVES[1:]]
+        obstacles = sum(c not in self.ground and c not in self.unexplored for c in beside)
+        worth = float(np.float64(look_ahead.CHANCES[obstacles]) * self.density * _UNIT)
+        return max(1, round(worth))
+
+    def gains(self, before: Cell, cell: Cell) -> dict[Cell, int]:
+        """Return what a move gets: the worth of a target, and of the cells that come into view."""
+        if (before, cell) not in self.known_gains:
+            in_view = (self.disc(cell) - self.disc(before)) & self.unexplored
+            targets = {cell} & self.targets
+            self.known_gains[before, cell] = {c: self.unseen_worth(c) for c in in_view} | {
+                c: _UNIT for c in targets
+            }
+        return self.known_gains[before, cell]
+
+
+def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> list[Label]:
+    """Search for routes of one robot.
+
+    :param claims: by cell the best discount at which a team mate gets it, and the mate
+    :return: all labels, the best one first; that of the start alone if nothing is to be gained
+    """
+    labels, layer = [Label([start])], [Label([start])]
+    best, top, t = {start: 0}, labels[0], 0
+    while layer and (t < look_ahead.DEPTH or top.value == 0):
+        t += 1
+        hopeless = top.value - int(look_ahead.SLACK * _UNIT) * discount(t)
+        following: dict[Cell, Label] = {}
+        for label in layer:
+            if label.value < hopeless:
+                continue
+            for action in range(1, 5):
+                before = label.path[-1]
+                cell = (before[0] + MOVES[action][0], before[1] + MOVES[action][1])
+                if cell not in known.ground:
+                    continue
+                value = label.value
+                for got, worth in known.gains(before, cell).items():
+                    value += worth * max(0, discount(t) - claims.get(got, (0, 0))[0])
+                if value > label.value and cell in label.path:
+                    value = label.value
+                    if value <= best[cell]:
+                        continue
+                first = {action} if t == 1 else label.first
+                if value == best.get(cell, -1) and cell in following:
+                    following[cell].first |= first
+                if value <= best.get(cell, -1):
+                    continue
+                best[cell] = value
+                begin = label.begin or (t if value > 0 else 0)
+                better = following.setdefault(cell, Label([]))
+                better.path, better.value = [*label.path, cell], value
+                better.first, better.begin = set(first), begin
+                if value > top.value:
+                    top = better
+        layer = list(following.values())
+        labels += layer
+    return [top, *(label for label in labels if label is not top)]
+
+
+class TeamRoutes:
+    """Routes of all robots of a team.
+
+    :param known: the map
+    :param robots: cells of the robots
+    """
+
+    def __init__(self, known: TeamMap, robots: list[Cell]) -> None:
+        self.known = known
+        self.found: list[list[Label]] = [[] for _ in robots]
+        self.robbed: set[int] = set()
+        for turn in range(look_ahead.ROUNDS):
+            for i, robot in enumerate(robots):
+                if turn > 0 and i not in self.robbed:
+                    continue
+                claims: dict[Cell, tuple[int, int]] = {}
+                for j in range(len(robots)):
+                    if j != i and self.found[j]:
+                        self.claim(j, claims)
+                self.robbed.discard(i)
+                self.found[i] = search(known, robot, claims)
+                if self.found[i][0].value == 0:
+                    self.found[i] = search(known, robot, {})
+                self.claim(i, claims)
+
+    def claim(self, i: int, claims: dict[Cell, tuple[int, int]]) -> None:
+        """Claim what a robot's route gets, and note who gets less by that."""
+        path = self.found[i][0].path
+        for t, cell in enumerate(path[1:], start=1):
+            for got in ({cell} & self.known.targets) | (
+                self.known.disc(cell) & self.known.unexplored
+            ):
+                owned, owner = claims.get(got, (0, i))
+                if owned < discount(t):
+                    if owner != i and owned >= discount(look_ahead.FIRM):
+                        self.robbed.add(owner)
+                    claims[got] = (discount(t), i)
+
+
+def route_features(known: TeamMap, robots: list[Cell]) -> np.ndarray:
+    """Return the row of ``sub_goal="routes"`` that is for the robot's route.
+
+    :return: float32 (n_agents, 11)
+    """
+    out = np.zeros((len(robots), 11), np.float32)
+    for i, (top, *others) in enumerate(TeamRoutes(known, robots).found):
+        if top.value == 0:
+            continue
+        out[i, list(top.first)] = 1.0
+        out[i, 5] = _nearness(top.begin)
+        for label in (top, *others):
+            for action in label.first:
+                out[i, 6 + action] = max(out[i, 6 + action], label.value / (_UNIT * _FINEST))
+    return out
+
+
+def _nearness(distance: int) -> float:
+    """0.9 ** distance, in fixed point."""
+    return (
+        round(float(np.float64(0.9) ** distance) * (1 << 32)) / (1 << 32) if distance < 212 else 0
+    )

@@ -1,0 +1,87 @@
+"""The row ``look_ahead``: whole teams that plan a few steps ahead, in microseconds.
+
+Ours. It is the fast relative of ``planner``: routes over the known map, worth what they cover and
+see and less as that comes later, planned by one robot after the other over what the others leave.
+Targets are worth 1, unseen cells the number of targets to be expected on them. Where ``planner``
+orders distant goals into long routes and searches that for milliseconds, this looks some steps
+ahead along all ways at once, see :mod:`area_search.look_ahead`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from area_search.look_ahead import (
+    TARGET_WORTH,
+    Labels,
+    Marks,
+    Routes,
+    Rules,
+    forget,
+    make_labels,
+    make_marks,
+    make_routes,
+    make_rules,
+    place,
+    plan_routes,
+)
+from sb3_roles.baselines.greedy import Walker, first_move, random_bits
+
+
+class LookAheadController(Walker):
+    """Every robot takes the first step of its route; all routes are planned anew at each step.
+
+    Among the moves with which a route can begin it takes one that goes straight on, else any. A
+    robot that can reach nothing worth a step stays.
+    """
+
+    def _allocate(self, n_teams: int, n: int, area: int) -> tuple[Any, ...]:
+        assert self.batch is not None
+        return (
+            make_rules(self.batch.scene, self.batch.cells.shape[2]),
+            make_marks(area),
+            make_labels(area),
+            make_routes(n, area),
+            np.zeros(n, np.int64),  # starts
+            np.zeros((n_teams, n), np.int64),  # heading
+        )
+
+    def _walk(self, *arguments: Any) -> None:
+        _walk_routes(*arguments)
+
+
+@njit(cache=True)
+def _walk_routes(
+    keys: np.ndarray,
+    episodes: np.ndarray,
+    steps: np.ndarray,
+    cells: np.ndarray,
+    border: int,
+    position: np.ndarray,
+    rules: Rules,
+    marks: Marks,
+    labels: Labels,
+    routes: Routes,
+    starts: np.ndarray,
+    heading: np.ndarray,
+    actions: np.ndarray,
+) -> None:
+    """Choose the actions of :class:`LookAheadController`.
+
+    :param heading: int64 (n_teams, n_agents), the last actions
+    """
+    n_agents = position.shape[1]
+    for m in range(position.shape[0]):
+        flat = cells[m].reshape(-1)
+        place(cells.shape[2], border, position[m], starts)
+        plan_routes(flat, starts, TARGET_WORTH, True, rules, marks, labels, routes)
+        forget(marks)
+        for i in range(n_agents):
+            action = 0
+            if routes.lengths[i] > 0:
+                bits = random_bits(keys[m], episodes[m], steps[m] * n_agents + i)
+                action = first_move(routes.first[i], heading[m, i], bits)
+            heading[m, i] = actions[m, i] = action
