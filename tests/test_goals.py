@@ -118,3 +118,10 @@ def test_wrong_options_are_one_line(kind, options, message):
     with pytest.raises(ValueError) as error:
         make_policy(kind, **options)
     assert message in one_line(error.value)
+
+
+def test_rows_have_weights_of_their_own_without_roles():
+    policy = make_policy("mappo", goal_key="sub_goal", goal_prior=[0.0, 4.0])
+    assert policy.goal_net.weights.tolist() == [0.0, 4.0]
+    with pytest.raises(ValueError, match="one for each of the 2 rows of 'sub_goal'"):
+        make_policy("mappo", goal_key="sub_goal", goal_prior=[1.0, 2.0, 3.0])

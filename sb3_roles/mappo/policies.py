@@ -28,7 +28,8 @@ class TeamActorCriticPolicy(TeamPolicy):
     :param goal_key: observation key whose rows begin with flags of the moves towards a sub-goal,
         such as area search's ``sub_goal``; None for no such logits
     :param goal_prior: first weight, learned from there on, of these flags in the moves' logits:
-        above 0, an untrained robot heads for its sub-goals, most where one move serves several
+        above 0, an untrained robot heads for its sub-goals, most where one move serves several; one
+        number for all rows or one for each
     :param options: see :class:`~sb3_roles.common.policies.TeamPolicy`
     :raises ValueError: if the action space is not discrete, or an option is unknown
     """
@@ -45,7 +46,7 @@ class TeamActorCriticPolicy(TeamPolicy):
         head_arch: Sequence[int] = (64, 32),
         value_arch: Sequence[int] = (64, 32),
         goal_key: str | None = None,
-        goal_prior: float = 2.0,
+        goal_prior: float | Sequence[float] = 2.0,
         **options: Any,
     ) -> None:
         if not isinstance(action_space, spaces.Discrete):
@@ -75,12 +76,21 @@ class TeamActorCriticPolicy(TeamPolicy):
         n_moves = int(self.action_space.n)
         self.action_net = Head(size, self.head_arch, n_moves, gain=0.01)
         n_goals = self._count_goals(self.goal_key, n_moves)
-        self.goal_net = (
-            GoalPrior(th.full((n_goals,), self.goal_prior), n_moves) if n_goals else None
-        )
+        self.goal_net = self._make_goal_net(n_goals, n_moves)
         size = self._add_encoders("value_primitive", self.critic_keys)
         self.value_net = Head(size, self.value_arch, 1, gain=1.0)  # type: ignore[assignment]
         self.action_dist = CategoricalDistribution(n_moves)
+
+    def _make_goal_net(self, n_goals: int, n_moves: int) -> GoalPrior | None:
+        if not n_goals:
+            return None
+        prior = th.tensor(self.goal_prior, dtype=th.float32)
+        if prior.ndim and prior.shape != (n_goals,):
+            raise ValueError(
+                f"goal_prior must be one number or one for each of the {n_goals} rows of "
+                f"{self.goal_key!r}, got {self.goal_prior!r}"
+            )
+        return GoalPrior(prior.expand(n_goals).clone(), n_moves)
 
     def _log_probs(self, obs: Observation, memo: dict[Any, th.Tensor]) -> th.Tensor:
         n_agents = self.team_size(obs)

@@ -17,6 +17,7 @@ from sb3_roles.zoo.ranges import (
     Flag,
     Items,
     Number,
+    OneOrMany,
     Options,
     Range,
     Text,
@@ -45,7 +46,7 @@ _OPTIMIZER = Options(
     }
 )
 
-_GOALS: dict[str, Range] = {"goal_key": Text(optional=True), "goal_prior": Number(0.0, 100.0)}
+_PRIOR = Number(0.0, 100.0)
 _TEAM_POLICY: dict[str, Range] = {
     "actor_keys": _KEYS,
     "critic_keys": _KEYS,
@@ -87,7 +88,8 @@ POLICY_ARGUMENTS: dict[str, dict[str, Range]] = {
         "actor_arch": _WIDTHS,
         "head_arch": _WIDTHS,
         "value_arch": _WIDTHS,
-        **_GOALS,
+        "goal_key": Text(optional=True),
+        "goal_prior": OneOrMany(_PRIOR),
     },
     "GNNPolicy": _GRAPH_POLICY,
     "H2GNNPolicy": {**_GRAPH_POLICY, "n_heads": Whole(1, 1024)},
@@ -100,9 +102,10 @@ POLICY_ARGUMENTS: dict[str, dict[str, Range]] = {
         "primitive_arch": _SOME_WIDTHS,
         "value_arch": _SOME_WIDTHS,
         "see_role": Flag(),
-        **_GOALS,
-        "other_goal_prior": Number(0.0, 100.0),
-        "shared_goal_prior": Number(0.0, 100.0),
+        "goal_key": Text(optional=True),
+        "goal_prior": _PRIOR,
+        "other_goal_prior": _PRIOR,
+        "shared_goal_prior": _PRIOR,
     },
     "RowPolicy": {"net_arch": _WIDTHS, "optimizer_kwargs": _OPTIMIZER},
     "RecurrentRowPolicy": {

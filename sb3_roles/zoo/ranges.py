@@ -203,6 +203,22 @@ class Items:
 
 
 @dataclass(frozen=True)
+class OneOrMany:
+    """One value, or a list of them.
+
+    :param item: what each of them may be
+    """
+
+    item: Range
+
+    def problem(self, value: Any) -> str | None:
+        """See :class:`Range`."""
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            return Items(self.item, least=1).problem(value)
+        return self.item.problem(value)
+
+
+@dataclass(frozen=True)
 class Options:
     """A mapping with known keys.
 
