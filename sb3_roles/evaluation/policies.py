@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from area_search import paths
 from area_search.random_streams import draw, episode_key, mix, to_unit
+from sb3_roles.common.actor_weights import actor_weights
 from sb3_roles.common.callbacks import role_options
 from sb3_roles.common.env_declarations import GoalNearness
 from sb3_roles.common.names import closest
@@ -125,7 +126,8 @@ class PolicyController:
     def description(self) -> dict[str, Any]:
         """What tells this controller from others, JSON values, for records."""
         digest = hashlib.sha256()
-        for name, value in self.policy.state_dict().items():
+        # Critics decide about nothing that is played, and files to act with lack them.
+        for name, value in actor_weights(self.policy).items():
             digest.update(name.encode())
             flat = value.detach().cpu().contiguous().reshape(-1)
             digest.update(flat.view(th.uint8).numpy().tobytes())

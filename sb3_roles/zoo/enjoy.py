@@ -7,7 +7,6 @@ import sys
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,65 +29,12 @@ if TYPE_CHECKING:
     import numpy as np
 
     from sb3_roles.evaluation.policies import PolicyController
+    from sb3_roles.zoo.loaded_run import LoadedRun
     from sb3_roles.zoo.options import Subparsers
     from sb3_roles.zoo.playback import Show
 
-_ALGO = "hmappo"
+_ALGO, _LOGS = "hmappo", Path("logs")
 _PERCENT = ("explo_paper", "explo_true", "cover")
-
-
-@dataclass(frozen=True)
-class LoadedRun:
-    """A trained policy and how it was trained.
-
-    :param folder: of the run
-    :param config: what its ``config.yml`` says
-    :param model: an SB3 model or policy
-    """
-
-    folder: Path
-    config: Mapping[str, Any]
-    model: Any
-
-    def controller(self, deterministic: bool, communicate: bool) -> PolicyController:
-        """Return the policy as a controller of episodes."""
-        from sb3_roles.evaluation.policies import PolicyController
-
-        roles = self.config.get("wrapper_kwargs") or {}
-        try:
-            return PolicyController(self.model, roles, deterministic, communicate)
-        except ValueError as error:
-            raise UsageError(f"{self.folder}: {error}") from error
-
-
-def load_run(
-    folder: Path,
-    best: bool = False,
-    device: str = "auto",
-    env: str | None = None,
-    algo: str | None = None,
-) -> LoadedRun:
-    """Load the policy of a run folder; no code of the folder runs.
-
-    :param folder: the run
-    :param best: the best policy of its evaluations instead of the last one
-    :param device: where the policy computes
-    :param env: the run's environment, which must be given for ``module:factory``
-    :param algo: the run's algorithm; may be left out
-    :raises UsageError: if it is no run folder, damaged, or of another algorithm or environment
-    """
-    from sb3_roles.zoo.config import read_run_config
-    from sb3_roles.zoo.environments import check_named
-
-    config = read_run_config(folder)
-    check_named(folder, config["env"], env)
-    if algo is not None and config["algo"] != algo:
-        raise UsageError(f"{folder}: its algorithm is {config['algo']}, not {algo}")
-
-    # Torch takes its time to import: not before the folder is known to be a run.
-    from sb3_roles.zoo.models import load_model
-
-    return LoadedRun(folder, config, load_model(folder, best, device, env))
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -110,15 +56,25 @@ def add_parser(subparsers: Subparsers) -> None:
         f"(default: {AREA_SEARCH})",
     )
     parser.add_argument(
+        "--pretrained",
+        nargs="?",
+        const="",
+        metavar="ROW",
+        help="play the weights that come with this package, of a learned row of the tables or "
+        "ROW/seed_K, instead of a run; by default of the row called like the algorithm",
+    )
+    parser.add_argument(
         "-f",
         "--folder",
         type=Path,
-        default=Path("logs"),
         metavar="DIR",
-        help="of the logs, or a run",
+        help=f"of the logs, or a run (default: {_LOGS})",
     )
     parser.add_argument(
-        "--exp-id", type=whole_number(0, 10**9), default=0, metavar="N", help="run; 0: the latest"
+        "--exp-id",
+        type=whole_number(0, 10**9),
+        metavar="N",
+        help="run; 0: the latest (default: 0)",
     )
     parser.add_argument("--load-best", action="store_true", help="the best evaluated policy")
     add_play_options(parser)
@@ -181,8 +137,6 @@ def run(args: Namespace) -> int:
     :raises UsageError: if there is no such run, or an option does not fit it
     """
     from sb3_roles.zoo.algorithms import get_algorithm
-    from sb3_roles.zoo.config import CONFIG_FILE
-    from sb3_roles.zoo.run_folder import find_run
 
     try:
         get_algorithm(args.algo or _ALGO)
@@ -190,11 +144,8 @@ def run(args: Namespace) -> int:
         raise UsageError(f"argument --algo: {error}") from None
     if args.video is not None:
         check_video(args.video)
-    folder = args.folder
-    if not (folder / CONFIG_FILE).is_file():
-        folder = find_run(folder, args.algo or _ALGO, args.env or AREA_SEARCH, args.exp_id)
-    loaded = load_run(folder, args.load_best, args.device, args.env, args.algo)
-    controller = loaded.controller(not args.stochastic, not args.no_communication)
+    loaded, drawn = _load(args)
+    controller = loaded.controller(not drawn, not args.no_communication)
     config = _changed(loaded.config, args)
     print(f"{config['algo']} on {config['env']}, {loaded.folder}")
     with _display(args, f"{config['algo']} on {config['env']}") as show:
@@ -209,6 +160,28 @@ def run(args: Namespace) -> int:
     if args.video is not None:
         print(f"wrote {args.video}")
     return 0
+
+
+def _load(args: Namespace) -> tuple[LoadedRun, bool]:
+    """Load what the command line asks for; also whether its actions are drawn."""
+    from sb3_roles.zoo.config import CONFIG_FILE
+    from sb3_roles.zoo.loaded_run import load_run
+    from sb3_roles.zoo.published import find_published
+    from sb3_roles.zoo.run_folder import find_run
+
+    if args.pretrained is not None:
+        for option in ("folder", "exp_id", "load_best"):
+            if (value := getattr(args, option)) is not None and value is not False:
+                name = option.replace("_", "-")
+                raise UsageError(f"argument --{name}: it is of a run, and not for --pretrained")
+        found = find_published(args.pretrained or args.algo or _ALGO)
+        drawn = found.is_drawn(args.deterministic, args.stochastic)
+        return found.load(args.device, args.env, args.algo), drawn
+    folder = _LOGS if args.folder is None else args.folder
+    if not (folder / CONFIG_FILE).is_file():
+        folder = find_run(folder, args.algo or _ALGO, args.env or AREA_SEARCH, args.exp_id or 0)
+    loaded = load_run(folder, args.load_best, args.device, args.env, args.algo)
+    return loaded, args.stochastic
 
 
 def _changed(config: Mapping[str, Any], args: Namespace) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from sb3_roles.evaluation.grid.entrants import Entrant
 from sb3_roles.zoo.config import CONFIG_FILE
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.published import published_runs
 from sb3_roles.zoo.row_runs import (
     Report,
     RunFinder,
@@ -41,7 +42,7 @@ def make_controller(entrant: Entrant) -> Controller:
         from sb3_roles.baselines import controller_class
 
         return controller_class(entrant.source)()
-    from sb3_roles.zoo.enjoy import load_run
+    from sb3_roles.zoo.loaded_run import load_run
 
     loaded = load_run(Path(entrant.source), device="cpu", env=AREA_SEARCH)
     return loaded.controller(deterministic=not entrant.drawn, communicate=True)
@@ -58,6 +59,7 @@ def pack(entrant: Entrant) -> Parcel:
     :raises CheckpointError: if it states wrong numbers of steps
     :raises OSError: if a file can not be read
     """
+    from sb3_roles.common.actor_weights import HOLDS
     from sb3_roles.common.checkpoint import write_checkpoint
     from sb3_roles.evaluation.grid.crews import Parcel
     from sb3_roles.evaluation.grid.store import named
@@ -68,10 +70,11 @@ def pack(entrant: Entrant) -> Parcel:
     run = Path(entrant.source)
     path, checkpoint = newest_checkpoint(run)
     steps = {key: steps_of(checkpoint, key) for key in ("env_steps", "agent_steps")}
+    holds = {key: checkpoint.manifest[key] for key in (HOLDS,) if key in checkpoint.manifest}
     with tempfile.TemporaryDirectory(prefix="sb3_roles-") as folder:
         weights = Path(folder, path.name)
         with named(weights):
-            write_checkpoint(weights, steps, checkpoint.policy)
+            write_checkpoint(weights, {**steps, **holds}, checkpoint.policy)
         content = weights.read_bytes()
     files = {
         CONFIG_FILE: (run / CONFIG_FILE).read_bytes(),
@@ -84,6 +87,8 @@ def find_entrants(
     plan: Plan, logs: Path, runs: Sequence[str] = (), report: Report = print
 ) -> dict[str, list[Entrant]]:
     """Find who plays for the rows that tables and figures need.
+
+    For a learned row these are its runs, or else the weights that come with this package.
 
     :param plan: the part of it that is wanted
     :param logs: folder of the runs
@@ -106,9 +111,11 @@ def find_entrants(
             if not all(fits(run, row) for run in named[name]):
                 report(f"{name}: named by hand, its configuration is not the row's")
         chosen = named[name] if name in named else finder.find(row)
-        if not chosen:
+        shipped = [] if chosen else published_runs(row, report)
+        if not (chosen or shipped):
             report(f"{name} has no run in {logs}: {training_command(row, logs)}")
         entrants[name] = [run.entrant(row) for run in chosen]
+        entrants[name] += [replace(run.entrant(row), shipped=True) for run in shipped]
     unneeded = [name for name in named if name not in entrants]
     if unneeded:
         raise UsageError(f"argument --runs: {closest('row', unneeded[0], entrants)}")

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_roles.baselines import CONTROLLER_NAMES, controller_class
-from sb3_roles.common.names import closest
-from sb3_roles.zoo.enjoy import add_play_options, load_run
+from sb3_roles.zoo.config import CONFIG_FILE
+from sb3_roles.zoo.enjoy import add_play_options
 from sb3_roles.zoo.environments import AREA_SEARCH
+from sb3_roles.zoo.loaded_run import load_run
 from sb3_roles.zoo.options import (
     MAX_SEED,
     UsageError,
@@ -26,12 +27,14 @@ from sb3_roles.zoo.options import (
     scene_of,
     whole_number,
 )
+from sb3_roles.zoo.published import find_published, is_published
 
 if TYPE_CHECKING:
     from area_search.scenes import Scene
     from sb3_roles.baselines.base import Controller
     from sb3_roles.evaluation.records import EpisodeRecords
     from sb3_roles.zoo.options import Parser, Subparsers
+    from sb3_roles.zoo.published import Published
 
 DEFAULT = "random"
 HELD_OUT_NOTE = (
@@ -66,8 +69,9 @@ def add_parser(subparsers: Subparsers) -> None:
         action="extend",
         required=True,
         metavar="NAME|RUN",
-        help=f"a run folder, or one of {', '.join(CONTROLLER_NAMES)}; several, separated by "
-        "commas or with the option repeated, are compared on the same episodes, with the first "
+        help=f"a run folder, one of {', '.join(CONTROLLER_NAMES)}, or a learned row of the tables, "
+        "whose weights come with this package, such as hmappo or hmappo/seed_1; several, separated "
+        "by commas or with the option repeated, are compared on the same episodes, with the first "
         "as the reference",
     )
     parser.add_argument("--load-best", action="store_true", help="the best evaluated policy")
@@ -168,16 +172,21 @@ def make_controllers(args: Namespace, names: Sequence[str]) -> dict[str, Control
     """Make the controllers, or load them.
 
     :param args: parsed arguments, for how a policy acts
-    :param names: run folders, or of scripted controllers
+    :param names: run folders, or of scripted controllers and of learned rows
     :return: by name, in the same order
     :raises UsageError: if one does not exist, is damaged, needs a package that is missing, or can
         not act as the options say
     """
-    for name in names:
-        # An empty name would be the folder that the command was started in.
-        if name not in CONTROLLER_NAMES and not (name and Path(name).is_dir()):
-            message = closest("controller or run folder", name, CONTROLLER_NAMES)
-            raise UsageError(f"argument --controller: {message}")
+    shipped = {
+        name: _published(name)
+        for name in names
+        if name not in CONTROLLER_NAMES and not _is_folder(name)
+    }
+    if shipped and getattr(args, "load_best", False):
+        raise UsageError(
+            f"argument --load-best: of {next(iter(shipped))} one set of weights comes with this "
+            "package"
+        )
     if all(name in CONTROLLER_NAMES for name in names):
         for option in _OF_POLICIES:
             if getattr(args, option, False):
@@ -192,10 +201,30 @@ def make_controllers(args: Namespace, names: Sequence[str]) -> dict[str, Control
                 made[name] = controller_class(name)()
             except ImportError as error:
                 raise UsageError(f"{name}: {error}") from error
+        elif name in shipped:
+            found = shipped[name]
+            drawn = found.is_drawn(args.deterministic, args.stochastic)
+            loaded = found.load(args.device, AREA_SEARCH)
+            made[name] = loaded.controller(not drawn, not args.no_communication)
         else:
             loaded = load_run(Path(name), args.load_best, args.device, AREA_SEARCH)
             made[name] = loaded.controller(not args.stochastic, not args.no_communication)
     return made
+
+
+def _is_folder(name: str) -> bool:
+    """Whether a name stands for a run folder: one that is none is only meant if nothing else is."""
+    # An empty name would be the folder that the command was started in.
+    if not (name and Path(name).is_dir()):
+        return False
+    return (Path(name) / CONFIG_FILE).is_file() or not is_published(name)
+
+
+def _published(name: str) -> Published:
+    try:
+        return find_published(name, "controller or run folder", CONTROLLER_NAMES)
+    except UsageError as error:
+        raise UsageError(f"argument --controller: {error}") from None
 
 
 def output_files(path: Path | None, option: str, names: Sequence[str]) -> dict[str, Path]:

@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_roles.common.actor_weights import ACTORS, HOLDS, load_actors
 from sb3_roles.common.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -193,7 +194,8 @@ def load_model(
 
     No code of the folder runs: nothing is unpickled, and the ``module:factory`` of a run on an
     environment of your own is imported and called only if ``env`` names it, too. The model has an
-    environment of one team, which was never reset.
+    environment of one team, which was never reset. Where the file holds the actors alone, as
+    ``sb3-roles publish`` writes it, the critics are untrained ones.
 
     :param run: the run folder
     :param best: the weights that evaluated best, instead of the latest ones
@@ -214,7 +216,10 @@ def load_model(
         with warnings.catch_warnings(), th.random.fork_rng(devices=[]):
             warnings.filterwarnings("ignore", category=UserWarning, module="stable_baselines3")
             model = make_model(small, make_env(small), device)
-        load_weights(model, checkpoint)
+        if checkpoint.manifest.get(HOLDS) == ACTORS:
+            load_actors(model.policy, checkpoint)
+        else:
+            load_weights(model, checkpoint)
         model.num_timesteps = steps_of(checkpoint, "agent_steps")
     except CheckpointError as error:
         raise UsageError(f"{folder}: {error}") from error

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_roles.common.files import remove_stale
 from sb3_roles.evaluation.report import PAGE
-from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
 from sb3_roles.zoo.machine import usable_cores
 from sb3_roles.zoo.options import UsageError, names_of, whole_number
+from sb3_roles.zoo.plans import read_plan_file
 from sb3_roles.zoo.ray_options import LOCAL, import_ray
-from sb3_roles.zoo.row_runs import LOGS, PLAN, config_of_row
+from sb3_roles.zoo.row_runs import LOGS, PLAN
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.crews import Crew
@@ -33,7 +33,8 @@ RECORDS = "records"
 _ABOUT = (
     "What was played once is kept in records, and only what is missing is played: a command that "
     "was interrupted goes on where it was. Learned rows are the runs of --log-folder with the "
-    f"configuration of the row. Exit code {EXIT_ROWS_FAILED}: a row failed and is left out."
+    "configuration of the row, or else the weights that come with this package. "
+    f"Exit code {EXIT_ROWS_FAILED}: a row failed and is left out."
 )
 
 
@@ -154,17 +155,8 @@ def read_plan(args: Namespace) -> Plan:
     :raises UsageError: if the file or a name is wrong
     """
     from sb3_roles.evaluation.grid.plan import PlanError
-    from sb3_roles.evaluation.grid.plan_file import parse_plan
 
-    file = config_file(PLAN) if args.plan is None else args.plan
-    content = read_yaml(file)
-    try:
-        plan = parse_plan(content)
-        for row in plan.rows.values():
-            if row.learned:
-                config_of_row(row)
-    except (PlanError, ConfigError) as error:
-        raise UsageError(f"{file}: {error}") from None
+    plan = read_plan_file(args.plan)
     try:
         return plan.select(args.tables, args.rows, args.scenes, args.figures)
     except PlanError as error:

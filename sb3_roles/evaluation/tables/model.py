@@ -97,6 +97,7 @@ class TableRow:
     :param decision: column -> median seconds of a decision on a joint step, a team's share of that
         for all teams of its batch
     :param batch: teams that were decided for together, at most; 0 if nothing was played
+    :param shipped: the weights that come with this package have played
     """
 
     name: str
@@ -110,6 +111,7 @@ class TableRow:
     overall: Mapping[tuple[int, str], Value]
     decision: Mapping[Column, float]
     batch: int
+    shipped: bool = False
 
     def decision_over(self, columns: Iterable[Column]) -> float | None:
         """Return the median of the decision times in some columns.
@@ -214,6 +216,7 @@ def _row(
         overall,
         decision,
         max((one.records.timing["batch_size"] for ones in own for one in ones), default=0),
+        any(one.entrant.shipped for ones in own for one in ones),
     )
 
 

@@ -172,6 +172,9 @@ def _who(rows: Sequence[TableRow]) -> Iterator[str]:
     if trained:
         each = "; ".join(f"{row.label} {row.budget}" for row in trained)
         yield f"Trained for: {each}. The paper trained for 5,000,000 joint steps."
+    shipped = _labels(trained, lambda row: row.shipped)
+    if shipped:
+        yield f"Played by the trained weights that come with this package: {shipped}."
     missing = _labels(rows, lambda row: row.learned and row.budget == "not trained")
     if missing:
         yield f"Not trained yet, and therefore empty: {missing}."
