@@ -154,7 +154,7 @@ def test_the_best_weights_are_those_of_their_step(runs, tell):
     assert (card["env_steps"], card["chosen"]) == (5000, "best")
 
 
-@pytest.mark.parametrize("algo", ["hmappo", "mappo", "ecc", "gnn", "h2gnn", "ppo", "trpo"])
+@pytest.mark.parametrize("algo", ["hmappo", "mappo", "ecc", "gnn", "h2gnn"])
 def test_no_policy_acts_by_its_critics(algo):
     settings: dict[str, Any] = {"n_timesteps": 8, "n_envs": 1}
     if algo != "gnn":
