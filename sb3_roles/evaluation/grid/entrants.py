@@ -20,6 +20,7 @@ class Entrant:
     :param drawn: draw actions instead of taking the likeliest ones
     :param training_seed: of the run; None for a scripted controller
     :param env_steps: joint steps that it was trained for; None for a scripted controller
+    :param role_control: see ``Row``
     """
 
     row: str
@@ -28,6 +29,7 @@ class Entrant:
     drawn: bool = False
     training_seed: int | None = None
     env_steps: int | None = None
+    role_control: str | None = None
 
 
 class Played(NamedTuple):

@@ -58,6 +58,8 @@ class Row:
     :param quick_episodes: the same in the quick form
     :param block: episodes that are played and kept at once
     :param about: half a sentence for readers
+    :param role_control: who chooses the roles while it plays, see ``RoleWrapper``; None for what it
+        was trained with
     """
 
     name: str
@@ -72,6 +74,7 @@ class Row:
     quick_episodes: int | None = None
     block: int = 100
     about: str = ""
+    role_control: str | None = None
 
     @property
     def learned(self) -> bool:
