@@ -21,7 +21,7 @@ class Found:
     """The runs of one variant.
 
     :param runs: seed -> the run that was trained for all of the budget
-    :param begun: seed -> a run with weights that was not, where there is no other
+    :param begun: seed -> a run of the first folder that has not got there, if there is no other
     :param missing: seeds of which there is neither
     """
 
@@ -38,7 +38,7 @@ def find_runs(
     Of several runs of a seed it is the newest of the first folder that has one.
 
     :param ablations: whose variants
-    :param folders: of runs, ``<folder>/<algo>/<run>``
+    :param folders: of runs, ``<folder>/<algo>/<run>``; runs of the first one may be gone on with
     :param report: takes lines about runs that can not be read
     :return: variant -> its runs; those that only play otherwise have those of their reference
     :raises ConfigError: if the configuration of a variant is wrong
@@ -47,11 +47,11 @@ def find_runs(
     found: dict[str, Found] = {}
     for variant in ablations.variants.values():
         if variant.runs_of not in found:
-            found[variant.runs_of] = _find(variant, finders)
+            found[variant.runs_of] = _find(variant, finders, report)
     return {name: found[variant.runs_of] for name, variant in ablations.variants.items()}
 
 
-def _find(variant: Variant, finders: Sequence[RunFinder]) -> Found:
+def _find(variant: Variant, finders: Sequence[RunFinder], report: Report) -> Found:
     from sb3_roles.zoo.algorithms import get_algorithm
 
     assert variant.row.algo is not None
@@ -59,18 +59,21 @@ def _find(variant: Variant, finders: Sequence[RunFinder]) -> Found:
     runs: dict[int, Run] = {}
     begun: dict[int, Run] = {}
     for finder in finders:
-        here: dict[int, Run] = {}
-        started: dict[int, Run] = {}
         planned = [
             run
             for run in finder.fitting(variant.row)
             if run.seed in variant.seeds and run.config["n_timesteps"] == variant.n_timesteps
         ]
+        here: dict[int, Run] = {}
         for run in finder.trained(planned):
-            whole = ends_itself or run.env_steps >= variant.n_timesteps
-            (here if whole else started)[run.seed] = run
+            if ends_itself or run.env_steps >= variant.n_timesteps:
+                # A newer run of a seed takes the place of an older one.
+                here[run.seed] = run
+            elif finder is finders[0]:
+                begun[run.seed] = run
+            else:
+                report(f"not taken: {run.folder} is at {run.env_steps:,} joint steps")
         runs = {**here, **runs}
-        begun = {**started, **begun}
     begun = {seed: run for seed, run in begun.items() if seed not in runs}
     missing = tuple(seed for seed in variant.seeds if seed not in runs and seed not in begun)
     return Found(dict(sorted(runs.items())), dict(sorted(begun.items())), missing)

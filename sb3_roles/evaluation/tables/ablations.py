@@ -184,7 +184,8 @@ def to_markdown(
             scene = study.scenes[table.column.scene]
             parts.append(f"**{markdown_text(scene)}, {table.column.n_agents} robots**")
             parts.append(_markdown_table(table, plan))
-            parts += [f"* {note}" for note in _own_notes(table, plan)]
+            notes = "\n".join(f"* {note}" for note in _own_notes(table, plan))
+            parts += [notes] if notes else []
     if commands:
         parts += ["## Trainings", "```\n" + "\n".join(commands) + "\n```"]
     return "\n\n".join(parts) + "\n"
@@ -252,7 +253,7 @@ def _markdown_table(table: StudyTable, plan: Plan) -> str:
                 for cell in (*cells, verdict, f"{line.about.n_timesteps:,}", n_runs)
             ]
         )
-    return aligned(lines)
+    return aligned(lines, texts=2)
 
 
 def _score(spread: Spread | None) -> str:

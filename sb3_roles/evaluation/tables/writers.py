@@ -77,7 +77,7 @@ def _about(tables: Mapping[str, TableResult]) -> str:
         [markdown_text(r.label), markdown_text(r.about), markdown_text(r.budget)]
         for r in rows.values()
     ]
-    return aligned(lines, numbers=False)
+    return aligned(lines, texts=None)
 
 
 def _common_notes(tables: Mapping[str, TableResult]) -> list[str]:
@@ -112,25 +112,26 @@ def _joined(cell: Text, mean: str, plus_minus: str) -> str:
     return f"{mean}{half}{beside}"
 
 
-def aligned(lines: Sequence[Sequence[str]], numbers: bool = True) -> str:
+def aligned(lines: Sequence[Sequence[str]], texts: int | None = 1) -> str:
     """Return a Markdown table whose cells are padded, so that it can be read as text, too.
 
     :param lines: of cells, the header first; a line of one cell, and empty ones, goes across
-    :param numbers: all columns but the first are flush right
+    :param texts: columns that are flush left, the others are flush right; None for all
     """
     # The name of a metric goes beyond its column, which is only as wide as the names of the rows.
     widths = [
         max(len(line[k]) for line in lines if k or line is lines[0] or any(line[1:]))
         for k in range(len(lines[0]))
     ]
+    left = len(widths) if texts is None else texts
     rule = [":" + "-" * (width - 1) for width in widths]
-    if numbers:
-        rule[1:] = [text[::-1] for text in rule[1:]]
+    rule[left:] = [text[::-1] for text in rule[left:]]
     padded = []
     for line in [lines[0], rule, *lines[1:]]:
-        cells = [line[0].ljust(widths[0])]
-        for cell, width in zip(line[1:], widths[1:], strict=True):
-            cells.append(cell.rjust(width) if numbers else cell.ljust(width))
+        cells = [
+            cell.ljust(width) if k < left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ]
         padded.append(f"| {' | '.join(cells)} |")
     return "\n".join(padded)
 
