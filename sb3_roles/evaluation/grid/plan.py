@@ -18,6 +18,7 @@ FIGURE_METRICS = {
     "training": ("explore_reward", "cover_reward"),
     "episode": ("explo_paper", "explo_true", "cover"),
     "roles": ("explore", "cover"),
+    "switching": ("switched",),
     "time_e": ("time_e_paper", "t90_true"),
 }
 """Kind of figure -> what it can show."""
