@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import shlex
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +24,19 @@ from sb3_roles.evaluation.records import read_records
 from sb3_roles.evaluation.tables.ablations import About, compare, to_csv, to_markdown
 from sb3_roles.evaluation.tables.differences import ALIKE, BETTER, WORSE, Difference, difference
 from sb3_roles.zoo.ablation_file import Ablations, parse_ablations
-from sb3_roles.zoo.ablation_runs import changes_of, commands_of, find_runs, missing_lines
-from sb3_roles.zoo.cli import main
+from sb3_roles.zoo.ablation_runs import (
+    Found,
+    changes_of,
+    commands_of,
+    find_runs,
+    missing_lines,
+    train_missing,
+)
+from sb3_roles.zoo.cli import main, make_parser
 from sb3_roles.zoo.config import config_file, read_yaml
 from sb3_roles.zoo.models import make_env, make_model, small_config
 from sb3_roles.zoo.row_runs import config_of_row, method_of_row
+from sb3_roles.zoo.train_jobs import GIVEN, new_jobs
 
 SMALL = {key: value for key, value in TINY.items() if key != "n_timesteps"}
 
@@ -224,21 +234,42 @@ def test_runs_are_found_by_configuration_budget_and_seed(tmp_path):
     ]
 
 
-def test_commands_are_those_of_the_variant():
-    from sb3_roles.zoo.cli import make_parser
-    from sb3_roles.zoo.train_jobs import GIVEN, new_jobs
+def jobs_of(command: Sequence[str]) -> list[dict[str, Any]]:
+    """Return what ``sb3-roles train`` would do."""
+    words = vars(make_parser().parse_args(command[1:]))
+    return new_jobs({k: v for k, v in words.items() if k in GIVEN and v is not None})[1]
 
+
+def test_commands_are_those_of_the_variant():
     variants = data()["variants"]
     variants["flat"]["seeds"] = [3, 4, 8]
     variant = parse_ablations(data(variants=variants)).variants["flat"]
-    jobs = []
-    for command in commands_of(variant, Path("logs")):
-        words = vars(make_parser().parse_args(shlex.split(command)[1:]))
-        jobs += new_jobs({k: v for k, v in words.items() if k in GIVEN and v is not None})[1]
+    commands = commands_of(variant, Path("logs"))
+    assert len(commands) == 2
+    jobs = [job for command in commands for job in jobs_of(shlex.split(command))]
     assert [job["config"]["seed"] for job in jobs] == [3, 4, 8]
     for job in jobs:
-        assert job["config"]["n_timesteps"] == 8
         assert {**job["config"], "seed": 0} == {**config_of_row(variant.row), "n_timesteps": 8}
+
+
+def test_what_is_trained_is_what_the_command_says(monkeypatch, tmp_path):
+    trained: list[dict[str, Any]] = []
+    monkeypatch.setattr("sb3_roles.zoo.job.run_job", lambda job: trained.append(job) or 0)
+    variants = data()["variants"]
+    variants["letter"] = {"label": "x", "algo": "hmappo", "conf": "hmappo_paper", "seeds": [5]}
+    own = parse_ablations(data(variants=variants)).variants["letter"]
+    for variant in (own, *shipped().variants.values()):
+        trained.clear()
+        nothing = Found({}, {}, variant.seeds)
+        told: list[str] = []
+        options = {"device": "cpu", "verbose": 0}
+        assert train_missing(variant, nothing, tmp_path, options, told.append) == (0, False)
+        assert len(trained) == len(variant.seeds) == len(told)
+        for job, command in zip(trained, told, strict=True):
+            assert job["command"] == shlex.split(command)
+            (wanted,) = jobs_of(job["command"])
+            assert job["config"] == wanted["config"]
+            assert job["options"]["log_folder"] == wanted["options"]["log_folder"]
 
 
 # The command
@@ -418,8 +449,7 @@ def test_tables_say_what_was_played():
     text = data()
     text["variants"] = {name: {"label": "x", "algo": "mappo"} for name in rows}
     text["studies"]["one"] |= {"reference": "ref", "variants": ["worse", "same", "gone"]}
-    plan = parse_ablations(text).plan()
-    object.__setattr__(plan, "rows", rows)
+    plan = replace(parse_ablations(text).plan(), rows=rows)
     column = Column("easy", 2)
     seed = held_out_seed(2000)
     best, worst = (
