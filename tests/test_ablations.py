@@ -258,13 +258,14 @@ def test_what_is_trained_is_what_the_command_says(monkeypatch, tmp_path):
     variants = data()["variants"]
     variants["letter"] = {"label": "x", "algo": "hmappo", "conf": "hmappo_paper", "seeds": [5]}
     own = parse_ablations(data(variants=variants)).variants["letter"]
-    for variant in (own, *shipped().variants.values()):
+    for one in (own, *shipped().variants.values()):
+        variant = replace(one, seeds=one.seeds[-1:])
         trained.clear()
         nothing = Found({}, {}, variant.seeds)
         told: list[str] = []
         options = {"device": "cpu", "verbose": 0}
         assert train_missing(variant, nothing, tmp_path, options, told.append) == (0, False)
-        assert len(trained) == len(variant.seeds) == len(told)
+        assert len(trained) == len(told) == 1
         for job, command in zip(trained, told, strict=True):
             assert job["command"] == shlex.split(command)
             (wanted,) = jobs_of(job["command"])
