@@ -13,10 +13,24 @@ import numpy as np
 
 from sb3_roles.baselines import controller_class
 from sb3_roles.baselines.random import RandomController
+from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.evaluation.grid.entrants import Entrant, Results
 from sb3_roles.evaluation.grid.plan import Plan
 from sb3_roles.evaluation.grid.plan_file import parse_plan
 from sb3_roles.evaluation.records import TIMINGS, EpisodeRecords
+from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.models import complete
+from sb3_roles.zoo.row_runs import config_of_row
+
+# A training of a moment, beside its own defaults.
+TINY = {
+    "n_timesteps": 8,
+    "n_envs": 2,
+    "n_steps": 2,
+    "batch_size": 2,
+    "n_epochs": 1,
+    "env_kwargs": {"horizon": 4, "n_agents": 2},
+}
 
 
 def plan_data(names: Sequence[str] = ("random", "greedy"), **changes: Any) -> dict[str, Any]:
@@ -53,6 +67,18 @@ def small_plan(names: Sequence[str] = ("random", "greedy"), **changes: Any) -> P
 def scripted(plan: Plan) -> dict[str, list[Entrant]]:
     """Return an entrant for every row, which is called like it."""
     return {name: [Entrant(name, name)] for name in plan.rows}
+
+
+def make_run(logs: Path, row: Any, number: int, steps: int, seed: int, **changes: Any) -> Path:
+    """Write what the finder reads of a run; its weights fit nothing."""
+    run = logs / row.algo / f"area-search-v0_{number}"
+    config = {**complete(config_of_row(row)), "seed": seed, "n_timesteps": 500, **changes}
+    run.mkdir(parents=True)
+    write_yaml(run / "config.yml", config)
+    folder = CheckpointFolder(run / "checkpoints")
+    folder.prepare()
+    folder.save(steps, manifest={"env_steps": steps}, policy={})
+    return run
 
 
 class Deadly(RandomController):

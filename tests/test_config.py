@@ -43,7 +43,8 @@ from sb3_roles.zoo.ranges import Number, Whole, yaml_number
 
 ROOT = Path(__file__).resolve().parents[1]
 # The plan of the tables is the configuration of no algorithm; test_tables_cli reads it.
-FILES = sorted(set((ROOT / "zoo_configs").glob("*.yml")) - {ROOT / "zoo_configs" / "tables.yml"})
+OTHERS = {"tables.yml", "ablations.yml"}
+FILES = sorted(path for path in (ROOT / "zoo_configs").glob("*.yml") if path.name not in OTHERS)
 ENV = "area-search-v0"
 GOOD = {"n_timesteps": 100}
 

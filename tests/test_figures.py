@@ -25,10 +25,10 @@ from sb3_roles.evaluation.figures.data import (
     common_curves,
     csv_of,
     mean_band,
-    role_shares,
 )
 from sb3_roles.evaluation.figures.draw import caption, draw_figures
 from sb3_roles.evaluation.figures.looks import looks
+from sb3_roles.evaluation.figures.role_curves import role_shares, role_switches
 from sb3_roles.evaluation.figures.training_logs import (
     TrainingLog,
     TrainingLogError,
@@ -77,6 +77,13 @@ PLAN = {
             "kind": "roles",
             "rows": ["hmappo"],
             "metrics": ["cover", "explore"],
+            **PLACES,
+        },
+        "switches": {
+            "caption": "Switching",
+            "kind": "switching",
+            "rows": ["hmappo"],
+            "metrics": ["switched"],
             **PLACES,
         },
         "times": {
@@ -219,6 +226,38 @@ def test_role_shares_are_of_the_robots_that_act() -> None:
         role_shares(records, "explore"), 1.0 - np.array(shares, np.float64)
     )
     assert role_shares(records, "guard") is None
+
+
+def test_switches_are_changes_from_the_step_before() -> None:
+    roles = [[[0, 1], [1, 1], [-1, -1]], [[0, 0], [0, 0], [1, 0]]]
+    records = records_of([[0, 0, 0]] * 2, roles=roles, role_names=["explore", "cover"])
+    np.testing.assert_array_equal(role_switches(records), [[0.5, np.nan], [0.0, 0.5]])
+    assert role_switches(records_of([[1, 2]])) is None
+
+
+def test_curves_of_switching_begin_at_the_second_step() -> None:
+    figure = replace(parse_plan(PLAN).figures["switches"], rows=("mappo", "hmappo"))
+    played = [Played(entrant("hmappo", seed), drawn_records(seed)) for seed in (1, 2)]
+    results = {
+        ("hmappo", HARD): played,
+        ("mappo", HARD): [Played(entrant("mappo", 1), records_of([[1, 2]]))],
+    }
+    lines: list[str] = []
+    (curve,) = collect(figure, results, {}, lines.append)
+    assert lines == ["figure switches: mappo has no roles, it is left out"]
+    assert isinstance(curve, Curve)
+    assert curve.x.tolist() == list(range(2, 13))
+    expected = np.mean(
+        [
+            (one.records.roles[:, 1:] != one.records.roles[:, :-1]).mean(axis=(0, 2))
+            for one in played
+        ],
+        axis=0,
+    )
+    np.testing.assert_allclose(curve.mean, 100 * expected)
+    assert (curve.low <= curve.mean).all() and (curve.mean <= curve.high).all()
+    (first, *_) = csv_of([curve]).decode().splitlines()[1:]
+    assert first.startswith("hmappo,hard,4,switched,2,")
 
 
 def test_rows_without_the_role_are_left_out_with_a_line() -> None:
@@ -423,6 +462,7 @@ def test_a_caption_says_what_is_shown(tmp_path: Path) -> None:
     assert "HMAPPO, 2 seeds of 8,000 joint steps" in train
     assert "uick form" in text("train", quick=True)
     assert "cover solid, explore dashed" in text("shares")
+    assert "whose role is another one than in the step before, in %." in text("switches")
     assert "counted from 0" in text("times")
 
 

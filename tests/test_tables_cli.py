@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from grids import assert_same, plan_data
+from grids import TINY, assert_same, make_run, plan_data
 
 from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.evaluation.grid.plan_file import parse_plan
@@ -27,22 +27,12 @@ from sb3_roles.zoo import tables
 from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import config_file, read_yaml, write_yaml
 from sb3_roles.zoo.entrants import pack
-from sb3_roles.zoo.models import complete
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.row_runs import RunFinder, config_of_row, training_command
 
 ROOT = Path(__file__).resolve().parents[1]
 PATHS = [str(ROOT / "envs"), str(ROOT), str(ROOT / "tests")]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(PATHS)}
-# A training of a moment, beside its own defaults.
-TINY = {
-    "n_timesteps": 8,
-    "n_envs": 2,
-    "n_steps": 2,
-    "batch_size": 2,
-    "n_epochs": 1,
-    "env_kwargs": {"horizon": 4, "n_agents": 2},
-}
 
 
 def write_plan(folder: Path, **changes: Any) -> str:
@@ -292,18 +282,6 @@ def test_without_matplotlib_there_are_tables_all_the_same(tell, tmp_path, monkey
 
 
 # Learned rows
-
-
-def make_run(logs: Path, row: Any, number: int, steps: int, seed: int, **changes: Any) -> Path:
-    """Write what the finder reads of a run; its weights fit nothing."""
-    run = logs / row.algo / f"area-search-v0_{number}"
-    config = {**complete(config_of_row(row)), "seed": seed, "n_timesteps": 500, **changes}
-    run.mkdir(parents=True)
-    write_yaml(run / "config.yml", config)
-    folder = CheckpointFolder(run / "checkpoints")
-    folder.prepare()
-    folder.save(steps, manifest={"env_steps": steps}, policy={})
-    return run
 
 
 def row_of(algo: str, **changes: Any) -> Any:

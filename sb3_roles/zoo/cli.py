@@ -26,6 +26,7 @@ COMMANDS = (
     "sb3_roles.zoo.records",
     "sb3_roles.zoo.tables",
     "sb3_roles.zoo.publish",
+    "sb3_roles.zoo.ablations",
     "sb3_roles.zoo.bench",
 )
 EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141

@@ -45,7 +45,7 @@ def make_controller(entrant: Entrant) -> Controller:
     from sb3_roles.zoo.loaded_run import load_run
 
     loaded = load_run(Path(entrant.source), device="cpu", env=AREA_SEARCH)
-    return loaded.controller(deterministic=not entrant.drawn, communicate=True)
+    return loaded.controller(not entrant.drawn, True, entrant.role_control)
 
 
 def pack(entrant: Entrant) -> Parcel:

@@ -58,7 +58,8 @@ class TrainingFailed(Exception):
 def run_job(job: Mapping[str, Any]) -> int:
     """Train in a run folder, and evaluate.
 
-    :param job: ``config``, ``options`` and ``resume``, plain data of ``zoo.train``
+    :param job: ``config``, ``options`` and ``resume``, plain data of ``zoo.train``, and where it is
+        not this process's own ``command``, the words of a command line that repeats it
     :return: exit code: 0, or 130 or 143 after a signal
     :raises UsageError: if environment, configuration or checkpoint do not fit
     :raises TrainingFailed: if a loss or reward is not finite, or the environment misbehaves
@@ -125,12 +126,12 @@ def _open_run(job: Mapping[str, Any]) -> tuple[Path, RunLock]:
     args = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
     # A resumed run shall add in the same order, wherever it is resumed.
     args["num_threads"] = th.get_num_threads()
-    write_description(path, complete(config), args, _command())
+    write_description(path, complete(config), args, _command(job))
     return path, lock
 
 
-def _command() -> list[str]:
-    return [Path(sys.argv[0]).name, *sys.argv[1:]]
+def _command(job: Mapping[str, Any]) -> list[str]:
+    return list(job.get("command") or [Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> int:
@@ -159,7 +160,7 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
             if resume is not None:
                 # A new n_timesteps is the run's from now on.
                 write_yaml(run / CONFIG_FILE, config)
-                note_command(run, _command())
+                note_command(run, _command(job))
 
         bar = [TeamProgressBar()] if options["progress"] else []
         try:

@@ -26,11 +26,21 @@ class LoadedRun:
     config: Mapping[str, Any]
     model: Any
 
-    def controller(self, deterministic: bool, communicate: bool) -> PolicyController:
-        """Return the policy as a controller of episodes."""
+    def controller(
+        self, deterministic: bool, communicate: bool, role_control: str | None = None
+    ) -> PolicyController:
+        """Return the policy as a controller of episodes.
+
+        :param deterministic: see ``PolicyController``
+        :param communicate: see ``PolicyController``
+        :param role_control: instead of what the run was trained with, see ``RoleWrapper``
+        :raises UsageError: if the policy can not be played so
+        """
         from sb3_roles.evaluation.policies import PolicyController
 
         roles = self.config.get("wrapper_kwargs") or {}
+        if role_control is not None:
+            roles = {**roles, "role_control": role_control}
         try:
             return PolicyController(self.model, roles, deterministic, communicate)
         except ValueError as error:

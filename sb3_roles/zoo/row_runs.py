@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.plan import Plan, Row
 
 LOGS = Path("logs")
-PLAN = "tables"
-"""Stem of the plan's file, which is beside the configurations."""
+PLAN, ABLATIONS = "tables", "ablations"
+"""Stems of the files that name rows, which are beside the configurations."""
 # Two runs that differ in these alone are runs of one configuration. What a file of demonstrations
 # holds is noted in the run itself; who recorded them is a key of its own.
 _FREE = ("seed", "n_timesteps", "vec_env", "demonstrations")
@@ -99,7 +99,8 @@ class Run:
         """Return who plays for a row with its weights."""
         from sb3_roles.evaluation.grid.entrants import Entrant
 
-        return Entrant(row.name, str(self.folder), True, row.drawn, self.seed, self.env_steps)
+        place, steps = str(self.folder), self.env_steps
+        return Entrant(row.name, place, True, row.drawn, self.seed, steps, row.role_control)
 
 
 def _method(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -108,10 +109,20 @@ def _method(config: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in complete(config).items() if key not in _FREE}
 
 
-def config_of_row(row: Row) -> dict[str, Any]:
+def method_of_row(row: Row) -> dict[str, Any]:
+    """Return what the runs of a learned row have in common, see :attr:`Run.method`.
+
+    :param row: a learned one
+    :raises ConfigError: see :func:`config_of_row`
+    """
+    return _method(config_of_row(row))
+
+
+def config_of_row(row: Row, what: str = "row") -> dict[str, Any]:
     """Return the configuration that a run of a learned row has.
 
     :param row: a learned one
+    :param what: it is called in the message of an error
     :raises ConfigError: naming the row, if its algorithm, its file or its parameters are wrong
     """
     assert row.algo is not None
@@ -119,26 +130,38 @@ def config_of_row(row: Row) -> dict[str, Any]:
         if row.algo not in ALGORITHMS:
             raise ConfigError([closest("algorithm", row.algo, ALGORITHMS)])
         conf = row.conf or row.algo
-        known = sorted({path.stem for path in config_file(conf).parent.glob("*.yml")} - {PLAN})
+        known = sorted({path.stem for path in config_file(conf).parent.glob("*.yml")})
+        known = [stem for stem in known if stem not in (PLAN, ABLATIONS)]
         if conf not in known:
             raise ConfigError([closest("conf", conf, known)])
         settings = load_settings(row.algo, AREA_SEARCH, config_file(conf))
         return resolve(row.algo, AREA_SEARCH, merge(settings, row.params))
     except ConfigError as error:
-        raise ConfigError(f"row {row.name}: {line}" for line in error.lines) from None
+        raise ConfigError(f"{what} {row.name}: {line}" for line in error.lines) from None
 
 
-def training_command(row: Row, logs: Path = LOGS) -> str:
+def training_command(
+    row: Row,
+    logs: Path = LOGS,
+    seeds: range = range(_N_SEEDS),
+    n_timesteps: int | None = None,
+) -> str:
     """Return the command line that trains the runs of a learned row.
 
     :param row: a learned one
     :param logs: folder of the runs
+    :param seeds: of the runs, at least one
+    :param n_timesteps: joint steps, instead of the configuration's
     """
     assert row.algo is not None
     words = ["sb3-roles", "train", "--algo", row.algo]
     if row.conf is not None:
         words += ["--conf-file", _relative(config_file(row.conf))]
-    words += ["--n-seeds", str(_N_SEEDS)]
+    if n_timesteps is not None:
+        words += ["-n", str(n_timesteps)]
+    if seeds.start:
+        words += ["--seed", str(seeds.start)]
+    words += ["--n-seeds", str(len(seeds))]
     if logs != LOGS:
         words += ["-f", str(logs)]
     if row.params:
@@ -163,7 +186,7 @@ def fits(run: Run, row: Row) -> bool:
     :param row: a learned one
     :raises ConfigError: if the row's configuration is wrong
     """
-    return run.method == _method(config_of_row(row))
+    return run.method == method_of_row(row)
 
 
 class RunFinder:
@@ -190,18 +213,14 @@ class RunFinder:
         :raises ConfigError: if the row's configuration is wrong
         """
         assert row.algo is not None
-        if row.algo not in self._runs:
-            self._runs[row.algo] = self._read(row.algo)
-        config = config_of_row(row)
-        if not self._runs[row.algo]:
+        fitting = self.fitting(row)
+        if not fitting:
             return []
         from sb3_roles.zoo.algorithms import get_algorithm
 
-        wanted = _method(config)
-        fitting = [run for run in self._runs[row.algo] if run.method == wanted]
         alike = get_algorithm(row.algo).clones
         groups: dict[tuple[int, int], dict[int, Run]] = {}
-        for run in self._trained(fitting):
+        for run in self.trained(fitting):
             steps = (0, 0) if alike else (run.env_steps, run.config["n_timesteps"])
             # A newer run of a seed takes the place of an older one.
             groups.setdefault(steps, {})[run.seed] = run
@@ -211,6 +230,21 @@ class RunFinder:
         chosen = [run for _, run in sorted(groups[largest].items())]
         self._report(f"{row.name}: {describe_runs(chosen)}{self._rest(fitting, chosen)}")
         return chosen
+
+    def fitting(self, row: Row) -> list[Run]:
+        """Return all runs of a row's configuration, trained or not, the oldest first.
+
+        :param row: a learned one
+        :raises ConfigError: if the row's configuration is wrong
+        """
+        assert row.algo is not None
+        if row.algo not in self._runs:
+            self._runs[row.algo] = self._read(row.algo)
+        config = config_of_row(row)
+        if not self._runs[row.algo]:
+            return []
+        wanted = _method(config)
+        return [run for run in self._runs[row.algo] if run.method == wanted]
 
     def _rest(self, fitting: Iterable[Run], chosen: Sequence[Run]) -> str:
         names = [run.folder.name for run in fitting if run not in chosen]
@@ -230,7 +264,8 @@ class RunFinder:
                 runs.append(Run(folder, config))
         return runs
 
-    def _trained(self, runs: Iterable[Run]) -> list[Run]:
+    def trained(self, runs: Iterable[Run]) -> list[Run]:
+        """Return those of some runs that have weights, and report the others."""
         found = []
         for run in runs:
             try:

@@ -144,7 +144,7 @@ def run_report(args: Namespace) -> int:
         return made
     from sb3_roles.zoo.table_outputs import write_page
 
-    write_page(args, made, _tell)
+    write_page(args, made, tell)
     return made.code
 
 
@@ -173,13 +173,7 @@ def make(args: Namespace) -> Made | int:
     plan = read_plan(args)
     if args.figures and find_spec("matplotlib") is None:
         raise UsageError("argument --figures: install sb3_roles[plots] to draw them")
-    there = next(path for path in (args.out, *args.out.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise UsageError(f"argument --out: {there} is no folder")
-    if not args.dry_run:
-        args.out.mkdir(parents=True, exist_ok=True)
-        if not os.access(args.out, os.W_OK):
-            raise UsageError(f"argument --out: {str(args.out)!r} can not be written")
+    check_out(args.out, write=not args.dry_run)
     # Read when they are imported: a job is one thread.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from sb3_roles.evaluation.grid.play import play
@@ -190,13 +184,13 @@ def make(args: Namespace) -> Made | int:
 
     if args.log_folder != LOGS and not args.log_folder.is_dir():
         raise UsageError(f"argument --log-folder: {str(args.log_folder)!r} is no folder")
-    entrants = find_entrants(plan, args.log_folder, args.runs, _tell)
-    store = RecordStore(args.out / RECORDS, _tell, set_aside=not args.dry_run)
+    entrants = find_entrants(plan, args.log_folder, args.runs, tell)
+    store = RecordStore(args.out / RECORDS, tell, set_aside=not args.dry_run)
     options: dict[str, Any] = {
         "pack": pack,
         "quick": args.quick,
         "episodes": args.episodes,
-        "report": _tell,
+        "report": tell,
     }
     if args.dry_run:
         survey = Survey(plan, entrants, store, make_controller, **options)
@@ -211,16 +205,32 @@ def make(args: Namespace) -> Made | int:
                 plan, entrants, store, make_controller, jobs, **options, crew=crew, bar=bar
             )
     except KeyboardInterrupt:
-        _tell(f"stopped; {store.folder} keeps what was played, and the same command goes on")
+        tell(f"stopped; {store.folder} keeps what was played, and the same command goes on")
         raise
-    made = write_all(args, plan, entrants, outcome, time.time() - started, _tell)
+    made = write_all(args, plan, entrants, outcome, time.time() - started, tell)
     if outcome.failures:
-        _tell(f"left out: {', '.join(outcome.failures)}")
+        tell(f"left out: {', '.join(outcome.failures)}")
         return made._replace(code=EXIT_ROWS_FAILED)
     return made
 
 
-def _tell(line: str) -> None:
+def check_out(folder: Path, write: bool) -> None:
+    """Find out, before work that takes long, whether a folder can be written to.
+
+    :param folder: of all that is made
+    :param write: make it if it is not there; otherwise it is only looked at
+    :raises UsageError: if it can not
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise UsageError(f"argument --out: {there} is no folder")
+    if write:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise UsageError(f"argument --out: {str(folder)!r} can not be written")
+
+
+def tell(line: str) -> None:
     """Print a line on stderr, above a progress bar if there is one."""
     from tqdm import tqdm  # type: ignore[import-untyped]
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_roles.common.files import csv_bytes
+from sb3_roles.evaluation.figures.role_curves import role_shares, role_switches
 from sb3_roles.evaluation.figures.training_logs import (
     TrainingLog,
     TrainingLogError,
@@ -19,7 +20,7 @@ from sb3_roles.evaluation.figures.training_logs import (
 from sb3_roles.evaluation.grid.entrants import Played, Results
 from sb3_roles.evaluation.grid.plan import Column, Figure
 from sb3_roles.evaluation.intervals import LEVEL, t_quantile
-from sb3_roles.evaluation.records import NO_ROLE, EpisodeRecords
+from sb3_roles.evaluation.records import EpisodeRecords
 from sb3_roles.evaluation.tables.aggregate import interquartile_mean, resample_runs
 from sb3_roles.evaluation.tables.scores import Score, score_cell
 
@@ -197,24 +198,16 @@ def band_of_row(values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, n
     return over_runs(means), low, high
 
 
-def role_shares(records: EpisodeRecords, role: str) -> np.ndarray | None:
-    """Return the share of the robots that act in a role.
-
-    :param records: of a controller
-    :param role: its name
-    :return: float64 (E, horizon), nan after the end of an episode; None if there is no such role
-    """
-    names = records.metadata["role_names"]
-    if role not in names:
-        return None
-    acting = (records.roles != NO_ROLE).sum(axis=2)
-    chosen = (records.roles == names.index(role)).sum(axis=2)
-    return np.where(acting > 0, chosen / np.maximum(acting, 1), np.nan)
-
-
 def _values(figure: Figure, records: EpisodeRecords, metric: str) -> np.ndarray | None:
-    """Return fractions for each episode and step, (E, horizon)."""
+    """Return fractions for each episode and step of ``_steps``."""
+    if figure.kind == "switching":
+        return role_switches(records)
     return role_shares(records, metric) if figure.kind == "roles" else records.curves[metric]
+
+
+def _steps(figure: Figure, n_values: int) -> np.ndarray:
+    """Return the steps that values belong to: a change of roles needs a step before."""
+    return np.arange(n_values) + (2 if figure.kind == "switching" else 1)
 
 
 def _episodes(figure: Figure, results: Results, warn: Warn) -> Iterator[Curve]:
@@ -227,11 +220,12 @@ def _episodes(figure: Figure, results: Results, warn: Warn) -> Iterator[Curve]:
                 known = [100.0 * values for values in found if values is not None]
                 if len(known) < len(found):
                     if (row, metric) not in told:
-                        warn(f"figure {figure.name}: {row} has no role {metric}, it is left out")
+                        lacks = "roles" if figure.kind == "switching" else f"role {metric}"
+                        warn(f"figure {figure.name}: {row} has no {lacks}, it is left out")
                         told.add((row, metric))
                     continue
                 mean, low, high = band_of_row(known)
-                x = np.arange(1, len(mean) + 1)
+                x = _steps(figure, len(mean))
                 yield Curve(row, column, metric, x, mean, low, high, origin_of(played))
 
 

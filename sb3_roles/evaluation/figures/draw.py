@@ -101,7 +101,7 @@ def caption(figure: Figure, quick: bool, plan: Plan, results: Results, logs: Log
 
 
 def _meant(figure: Figure) -> Sequence[str]:
-    return () if figure.kind == "roles" else figure.metrics
+    return () if figure.kind in ("roles", "switching") else figure.metrics
 
 
 def _quick_form(drawn: Drawn) -> str:
@@ -129,6 +129,8 @@ def _drawn_how(figure: Figure, drawn: Drawn) -> list[str]:
         styles = {"cover": "solid", "explore": "dashed"}
         lines = ", ".join(f"{role} {styles[role]}" for role in figure.metrics)
         how.insert(0, f"share of the robots in the role, in %: {lines}")
+    elif figure.kind == "switching":
+        how.insert(0, "share of the robots whose role is another one than in the step before, in %")
     elif figure.kind == "episode":
         how.insert(0, "beside each panel: at the end of the episodes")
         if "explo_paper" in figure.metrics or "explo_true" in figure.metrics:

@@ -34,7 +34,7 @@ PAPER = "the paper"
 _MARKS = 8  # markers on a line
 _MANY = 5  # lines in a panel
 _BAND = 0.18  # opacity
-_ROLE_DASHES = {"cover": "-", "explore": (0, (4, 1.5))}
+_ROLE_DASHES = {"cover": "-", "explore": (0, (4, 1.5)), "switched": "-"}
 _SCENE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
 
 
@@ -52,7 +52,7 @@ def draw(plan: Plan, figure: Figure, drawn: Drawn, note: str) -> Canvas:
     curves = [one for one in drawn if isinstance(one, Curve)]
     if figure.kind == "training":
         _draw_training(canvas, plan, figure, curves)
-    elif figure.kind == "roles":
+    elif figure.kind in ("roles", "switching"):
         _draw_roles(canvas, plan, figure, curves)
     elif figure.kind == "episode":
         _draw_episodes(canvas, plan, figure, curves)
@@ -157,7 +157,8 @@ def _end(axes: Axes, place: float, ends: tuple[float, float, float], look: Look)
 
 
 def _draw_roles(canvas: Canvas, plan: Plan, figure: Figure, curves: Sequence[Curve]) -> None:
-    """Draw one panel for each row and number of robots, a line for each scene and role."""
+    """Draw one panel for each row and number of robots, a line for each scene and metric."""
+    switching = figure.kind == "switching"
     panels: dict[tuple[str, int], list[tuple[str, Curve]]] = {}
     for curve in curves:
         if curve.column is not None:
@@ -181,13 +182,18 @@ def _draw_roles(canvas: Canvas, plan: Plan, figure: Figure, curves: Sequence[Cur
             _line(axes, curve.x, curve, look, scenes.index(scene) / len(scenes), _BAND)
             _stars(axes, figure, curve, look.color)
         axes.set_title(plan.rows[row].label + (f", {team(n_agents)}" if many_teams else ""))
-        axes.set_ylim(0.0, 100.0)
+        if not switching:
+            axes.set_ylim(0.0, 100.0)
         axes.margins(x=0.02)
         axes.xaxis.set_tick_params(labelbottom=True)
         axes.set_xlabel("step" if k + n_columns >= len(panels) else "")
         if k % n_columns == 0:
             one_role = f" {figure.metrics[0]}" if len(figure.metrics) == 1 else ""
-            axes.set_ylabel(f"robots in the role{one_role} (%)")
+            in_role = f"robots in the role{one_role} (%)"
+            axes.set_ylabel("robots that change their role (%)" if switching else in_role)
+    if switching:
+        # Of all panels, which share it: it depends on the curves how far up it goes.
+        grid[0].set_ylim(bottom=0.0)
     for axes in grid[len(panels) :]:
         axes.remove()
     handles = [line_handle(look, figure.scenes[scene]) for scene, look in styles.items()]

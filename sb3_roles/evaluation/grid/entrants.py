@@ -21,6 +21,7 @@ class Entrant:
     :param training_seed: of the run; None for a scripted controller
     :param env_steps: joint steps that it was trained for; None for a scripted controller
     :param shipped: its weights come with this package
+    :param role_control: see ``Row``
     """
 
     row: str
@@ -30,6 +31,7 @@ class Entrant:
     training_seed: int | None = None
     env_steps: int | None = None
     shipped: bool = False
+    role_control: str | None = None
 
 
 class Played(NamedTuple):

@@ -18,6 +18,7 @@ FIGURE_METRICS = {
     "training": ("explore_reward", "cover_reward"),
     "episode": ("explo_paper", "explo_true", "cover"),
     "roles": ("explore", "cover"),
+    "switching": ("switched",),
     "time_e": ("time_e_paper", "t90_true"),
 }
 """Kind of figure -> what it can show."""
@@ -58,6 +59,8 @@ class Row:
     :param quick_episodes: the same in the quick form
     :param block: episodes that are played and kept at once
     :param about: half a sentence for readers
+    :param role_control: who chooses the roles while it plays, see ``RoleWrapper``; None for what it
+        was trained with
     """
 
     name: str
@@ -72,6 +75,7 @@ class Row:
     quick_episodes: int | None = None
     block: int = 100
     about: str = ""
+    role_control: str | None = None
 
     @property
     def learned(self) -> bool:

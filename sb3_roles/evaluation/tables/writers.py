@@ -54,16 +54,16 @@ def to_markdown(tables: Mapping[str, TableResult]) -> str:
     if common:
         parts += ["## How to read the tables", _bullets(common)]
     for table in tables.values():
-        parts.append(f"## {_markdown(table.caption)}")
+        parts.append(f"## {markdown_text(table.caption)}")
         blocks = blocks_of(table)
         for block in blocks:
             if len(blocks) > 1:
                 parts.append(f"### {block.n_agents} robots")
-            lines = [[_markdown(cell) for cell in block.header]]
+            lines = [[markdown_text(cell) for cell in block.header]]
             for metric, group in block.groups.items():
-                lines.append([f"**{_markdown(metric)}**", *[""] * (len(block.header) - 1)])
+                lines.append([f"**{markdown_text(metric)}**", *[""] * (len(block.header) - 1)])
                 lines += [_markdown_line(line) for line in group]
-            parts.append(_aligned(lines))
+            parts.append(aligned(lines))
         own = [note for note in table.notes if note not in common]
         if own:
             parts.append(_bullets(own))
@@ -73,8 +73,11 @@ def to_markdown(tables: Mapping[str, TableResult]) -> str:
 def _about(tables: Mapping[str, TableResult]) -> str:
     rows = {row.name: row for table in tables.values() for row in table.rows}
     lines = [["Method", "What it is", "Trained for"]]
-    lines += [[_markdown(r.label), _markdown(r.about), _markdown(r.budget)] for r in rows.values()]
-    return _aligned(lines, numbers=False)
+    lines += [
+        [markdown_text(r.label), markdown_text(r.about), markdown_text(r.budget)]
+        for r in rows.values()
+    ]
+    return aligned(lines, texts=None)
 
 
 def _common_notes(tables: Mapping[str, TableResult]) -> list[str]:
@@ -83,15 +86,16 @@ def _common_notes(tables: Mapping[str, TableResult]) -> list[str]:
 
 
 def _bullets(notes: Sequence[str]) -> str:
-    return "\n".join(f"* {_markdown(note)}" for note in notes)
+    return "\n".join(f"* {markdown_text(note)}" for note in notes)
 
 
-def _markdown(text: str) -> str:
+def markdown_text(text: str) -> str:
+    """Return a text that Markdown shows as it is."""
     return re.sub(r"([\\|*<`\[])", r"\\\1", text)
 
 
 def _markdown_line(line: Line) -> list[str]:
-    label = _markdown(line.label)
+    label = markdown_text(line.label)
     cells = [_markdown_cell(cell) for cell in line.cells]
     return [f"*{label}*" if line.bound else label, *cells, line.decision.replace(" ", _FIXED)]
 
@@ -108,21 +112,26 @@ def _joined(cell: Text, mean: str, plus_minus: str) -> str:
     return f"{mean}{half}{beside}"
 
 
-def _aligned(lines: Sequence[Sequence[str]], numbers: bool = True) -> str:
-    """Pad the cells of a Markdown table, so that it can be read as text, too."""
+def aligned(lines: Sequence[Sequence[str]], texts: int | None = 1) -> str:
+    """Return a Markdown table whose cells are padded, so that it can be read as text, too.
+
+    :param lines: of cells, the header first; a line of one cell, and empty ones, goes across
+    :param texts: columns that are flush left, the others are flush right; None for all
+    """
     # The name of a metric goes beyond its column, which is only as wide as the names of the rows.
     widths = [
         max(len(line[k]) for line in lines if k or line is lines[0] or any(line[1:]))
         for k in range(len(lines[0]))
     ]
+    left = len(widths) if texts is None else texts
     rule = [":" + "-" * (width - 1) for width in widths]
-    if numbers:
-        rule[1:] = [text[::-1] for text in rule[1:]]
+    rule[left:] = [text[::-1] for text in rule[left:]]
     padded = []
     for line in [lines[0], rule, *lines[1:]]:
-        cells = [line[0].ljust(widths[0])]
-        for cell, width in zip(line[1:], widths[1:], strict=True):
-            cells.append(cell.rjust(width) if numbers else cell.ljust(width))
+        cells = [
+            cell.ljust(width) if k < left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ]
         padded.append(f"| {' | '.join(cells)} |")
     return "\n".join(padded)
 
