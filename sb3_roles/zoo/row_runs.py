@@ -99,8 +99,8 @@ class Run:
         """Return who plays for a row with its weights."""
         from sb3_roles.evaluation.grid.entrants import Entrant
 
-        place, steps = str(self.folder), self.env_steps
-        return Entrant(row.name, place, True, row.drawn, self.seed, steps, row.role_control)
+        place, steps, control = str(self.folder), self.env_steps, row.role_control
+        return Entrant(row.name, place, True, row.drawn, self.seed, steps, role_control=control)
 
 
 def _method(config: Mapping[str, Any]) -> dict[str, Any]:
