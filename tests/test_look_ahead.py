@@ -9,7 +9,7 @@ import pytest
 from helpers import DOWN, LEFT, RIGHT, STOP, UP, hand_made
 
 from area_search import BatchedAreaSearch, Scene
-from area_search.look_ahead import CHANCES, DEPTH, DISCOUNT
+from area_search.look_ahead_data import CHANCES, DEPTH, DISCOUNT
 from sb3_roles.baselines import controller_class
 from sb3_roles.evaluation.episodes import run_episodes
 

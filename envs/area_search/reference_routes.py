@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from area_search import look_ahead
+from area_search import look_ahead_data as constants
 
 Cell = tuple[int, int]
 MOVES: tuple[Cell, ...] = ((0, 0), (-1, 0), (0, 1), (1, 0), (0, -1))
@@ -22,7 +22,7 @@ _FINEST = 1 << 20
 @cache
 def discount(steps: int) -> int:
     """What is left of a worth after some steps, in fixed point, never nothing."""
-    return max(1, round(float(np.float64(look_ahead.DISCOUNT) ** steps) * _FINEST))
+    return max(1, round(float(np.float64(constants.DISCOUNT) ** steps) * _FINEST))
 
 
 @dataclass
@@ -57,7 +57,7 @@ class TeamMap:
         """Return the worth of an unseen cell; off the map all is known to be obstacles."""
         beside = [(cell[0] + dr, cell[1] + dc) for dr, dc in MOVES[1:]]
         obstacles = sum(c not in self.ground and c not in self.unexplored for c in beside)
-        worth = float(np.float64(look_ahead.CHANCES[obstacles]) * self.density * _UNIT)
+        worth = float(np.float64(constants.CHANCES[obstacles]) * self.density * _UNIT)
         return max(1, round(worth))
 
     def gains(self, before: Cell, cell: Cell) -> dict[Cell, int]:
@@ -79,9 +79,9 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
     """
     labels, layer = [Label([start])], [Label([start])]
     best, top, t = {start: 0}, labels[0], 0
-    while layer and (t < look_ahead.DEPTH or top.value == 0):
+    while layer and (t < constants.DEPTH or top.value == 0):
         t += 1
-        hopeless = top.value - int(look_ahead.SLACK * _UNIT) * discount(t)
+        hopeless = top.value - int(constants.SLACK * _UNIT) * discount(t)
         following: dict[Cell, Label] = {}
         for label in layer:
             if label.value < hopeless:
@@ -126,7 +126,7 @@ class TeamRoutes:
         self.known = known
         self.found: list[list[Label]] = [[] for _ in robots]
         self.robbed: set[int] = set()
-        for turn in range(look_ahead.ROUNDS):
+        for turn in range(constants.ROUNDS):
             for i, robot in enumerate(robots):
                 if turn > 0 and i not in self.robbed:
                     continue
@@ -149,7 +149,7 @@ class TeamRoutes:
             ):
                 owned, owner = claims.get(got, (0, i))
                 if owned < discount(t):
-                    if owner != i and owned >= discount(look_ahead.FIRM):
+                    if owner != i and owned >= discount(constants.FIRM):
                         self.robbed.add(owner)
                     claims[got] = (discount(t), i)
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from area_search import assignment, kernels, look_ahead, paths
+from area_search import assignment, kernels, look_ahead, look_ahead_data, paths
 from area_search import cells as layout
 
 if TYPE_CHECKING:
@@ -136,10 +136,10 @@ class TeamSlice:
                 cells,
                 border,
                 position,
-                look_ahead.make_rules(scene, stride),
-                look_ahead.make_marks(area),
-                look_ahead.make_labels(area),
-                look_ahead.make_routes(arrays.n_agents, area),
+                look_ahead_data.make_rules(scene, stride),
+                look_ahead_data.make_marks(area),
+                look_ahead_data.make_labels(area),
+                look_ahead_data.make_routes(arrays.n_agents, area),
                 np.zeros(arrays.n_agents, np.int64),  # starts
                 paths.discount_table(),
                 out,

@@ -14,20 +14,19 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from area_search.look_ahead import (
+from area_search.look_ahead import place, plan_routes
+from area_search.look_ahead_data import (
     TARGET_WORTH,
     Labels,
     Marks,
     Routes,
     Rules,
-    forget,
     make_labels,
     make_marks,
     make_routes,
     make_rules,
-    place,
-    plan_routes,
 )
+from area_search.look_ahead_search import forget
 from sb3_roles.baselines.greedy import Walker, first_move, random_bits
 
 
