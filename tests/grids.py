@@ -20,7 +20,7 @@ from sb3_roles.evaluation.grid.plan_file import parse_plan
 from sb3_roles.evaluation.records import TIMINGS, EpisodeRecords
 from sb3_roles.zoo.config import write_yaml
 from sb3_roles.zoo.models import complete
-from sb3_roles.zoo.row_runs import config_of_row
+from sb3_roles.zoo.row_configs import config_of_row
 
 # A training of a moment, beside its own defaults.
 TINY = {

@@ -12,7 +12,7 @@ from sb3_roles.evaluation.callback import save_policy
 from sb3_roles.zoo.config import write_yaml
 from sb3_roles.zoo.models import complete, make_env, make_model, small_config
 from sb3_roles.zoo.plans import learned_rows, read_plan_file
-from sb3_roles.zoo.row_runs import config_of_row
+from sb3_roles.zoo.row_configs import config_of_row
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 COMMAND = f"""train.py --algo hmappo -f /somewhere/else --num-threads 1

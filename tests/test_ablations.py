@@ -35,7 +35,7 @@ from sb3_roles.zoo.ablation_runs import (
 from sb3_roles.zoo.cli import main, make_parser
 from sb3_roles.zoo.config import config_file, read_yaml
 from sb3_roles.zoo.models import make_env, make_model, small_config
-from sb3_roles.zoo.row_runs import config_of_row, method_of_row
+from sb3_roles.zoo.row_configs import config_of_row, method_of_row
 from sb3_roles.zoo.train_jobs import GIVEN, new_jobs
 
 SMALL = {key: value for key, value in TINY.items() if key != "n_timesteps"}

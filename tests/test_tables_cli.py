@@ -28,7 +28,8 @@ from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import config_file, read_yaml, write_yaml
 from sb3_roles.zoo.entrants import pack
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.row_runs import RunFinder, config_of_row, training_command
+from sb3_roles.zoo.row_configs import config_of_row, training_command
+from sb3_roles.zoo.row_runs import RunFinder
 
 ROOT = Path(__file__).resolve().parents[1]
 PATHS = [str(ROOT / "envs"), str(ROOT), str(ROOT / "tests")]

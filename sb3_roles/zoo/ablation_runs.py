@@ -11,7 +11,8 @@ from typing import Any
 from sb3_roles.zoo.ablation_file import Ablations, Variant
 from sb3_roles.zoo.config import config_file
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.row_runs import Report, Run, RunFinder, method_of_row, training_command
+from sb3_roles.zoo.row_configs import method_of_row, training_command
+from sb3_roles.zoo.row_runs import Report, Run, RunFinder
 
 _NESTED = "_kwargs"
 

@@ -16,7 +16,7 @@ from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
 from sb3_roles.zoo.launcher import prepare_process
 from sb3_roles.zoo.machine import usable_cores
 from sb3_roles.zoo.options import DEVICES, UsageError, names_of, one_of, whole_number
-from sb3_roles.zoo.row_runs import ABLATIONS, LOGS, PLAN, config_of_row
+from sb3_roles.zoo.row_configs import ABLATIONS, LOGS, PLAN, config_of_row
 from sb3_roles.zoo.tables import EXIT_ROWS_FAILED, RECORDS, check_out, tell
 
 if TYPE_CHECKING:

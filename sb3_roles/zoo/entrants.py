@@ -14,6 +14,7 @@ from sb3_roles.zoo.config import CONFIG_FILE
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.published import published_runs
+from sb3_roles.zoo.row_configs import training_command
 from sb3_roles.zoo.row_runs import (
     Report,
     RunFinder,
@@ -21,7 +22,6 @@ from sb3_roles.zoo.row_runs import (
     fits,
     named_runs,
     newest_checkpoint,
-    training_command,
 )
 from sb3_roles.zoo.run_folder import CHECKPOINTS
 

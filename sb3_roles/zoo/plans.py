@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.row_runs import PLAN, config_of_row
+from sb3_roles.zoo.row_configs import PLAN, config_of_row
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.plan import Plan, Row

@@ -12,7 +12,8 @@ from sb3_roles.zoo.model_card import CardError, check_files, read_card
 from sb3_roles.zoo.options import UsageError, one_of, whole_number
 from sb3_roles.zoo.plans import learned_rows, read_plan_file
 from sb3_roles.zoo.published import FOLDER, published
-from sb3_roles.zoo.row_runs import PLAN, Run, fits, named_runs
+from sb3_roles.zoo.row_configs import PLAN
+from sb3_roles.zoo.row_runs import Run, fits, named_runs
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.plan import Plan, Row

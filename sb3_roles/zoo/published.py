@@ -127,7 +127,7 @@ def find_published(
 
 
 def _how(row: Row) -> str:
-    from sb3_roles.zoo.row_runs import training_command
+    from sb3_roles.zoo.row_configs import training_command
 
     return f"train some with {training_command(row)}"
 

@@ -1,8 +1,7 @@
-"""The runs of ``train`` that play for a learned row of a plan."""
+"""The runs of ``train`` that play for a learned row of a plan, found in folders."""
 
 from __future__ import annotations
 
-import shlex
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,32 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_roles.common.names import closest, span_text
-from sb3_roles.zoo.algorithms import ALGORITHMS
-from sb3_roles.zoo.config import (
-    CONFIG_FILE,
-    ConfigError,
-    config_file,
-    load_settings,
-    merge,
-    read_run_config,
-    resolve,
-)
+from sb3_roles.zoo.config import CONFIG_FILE, read_run_config
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.row_configs import config_of_row, method_of, method_of_row
 from sb3_roles.zoo.run_folder import CHECKPOINTS
 
 if TYPE_CHECKING:
     from sb3_roles.common.checkpoint import Checkpoint
     from sb3_roles.evaluation.grid.entrants import Entrant
     from sb3_roles.evaluation.grid.plan import Plan, Row
-
-LOGS = Path("logs")
-PLAN, ABLATIONS = "tables", "ablations"
-"""Stems of the files that name rows, which are beside the configurations."""
-# Two runs that differ in these alone are runs of one configuration. What a file of demonstrations
-# holds is noted in the run itself; who recorded them is a key of its own.
-_FREE = ("seed", "n_timesteps", "vec_env", "demonstrations")
-_N_SEEDS = 3
 
 Report = Callable[[str], None]
 
@@ -79,7 +62,7 @@ class Run:
     @cached_property
     def method(self) -> dict[str, Any]:
         """What it has in common with other runs of its configuration."""
-        return _method(self.config)
+        return method_of(self.config)
 
     @cached_property
     def env_steps(self) -> int:
@@ -101,82 +84,6 @@ class Run:
 
         place, steps, control = str(self.folder), self.env_steps, row.role_control
         return Entrant(row.name, place, True, row.drawn, self.seed, steps, role_control=control)
-
-
-def _method(config: Mapping[str, Any]) -> dict[str, Any]:
-    from sb3_roles.zoo.models import complete
-
-    return {key: value for key, value in complete(config).items() if key not in _FREE}
-
-
-def method_of_row(row: Row) -> dict[str, Any]:
-    """Return what the runs of a learned row have in common, see :attr:`Run.method`.
-
-    :param row: a learned one
-    :raises ConfigError: see :func:`config_of_row`
-    """
-    return _method(config_of_row(row))
-
-
-def config_of_row(row: Row, what: str = "row") -> dict[str, Any]:
-    """Return the configuration that a run of a learned row has.
-
-    :param row: a learned one
-    :param what: it is called in the message of an error
-    :raises ConfigError: naming the row, if its algorithm, its file or its parameters are wrong
-    """
-    assert row.algo is not None
-    try:
-        if row.algo not in ALGORITHMS:
-            raise ConfigError([closest("algorithm", row.algo, ALGORITHMS)])
-        conf = row.conf or row.algo
-        known = sorted({path.stem for path in config_file(conf).parent.glob("*.yml")})
-        known = [stem for stem in known if stem not in (PLAN, ABLATIONS)]
-        if conf not in known:
-            raise ConfigError([closest("conf", conf, known)])
-        settings = load_settings(row.algo, AREA_SEARCH, config_file(conf))
-        return resolve(row.algo, AREA_SEARCH, merge(settings, row.params))
-    except ConfigError as error:
-        raise ConfigError(f"{what} {row.name}: {line}" for line in error.lines) from None
-
-
-def training_command(
-    row: Row,
-    logs: Path = LOGS,
-    seeds: range = range(_N_SEEDS),
-    n_timesteps: int | None = None,
-) -> str:
-    """Return the command line that trains the runs of a learned row.
-
-    :param row: a learned one
-    :param logs: folder of the runs
-    :param seeds: of the runs, at least one
-    :param n_timesteps: joint steps, instead of the configuration's
-    """
-    assert row.algo is not None
-    words = ["sb3-roles", "train", "--algo", row.algo]
-    if row.conf is not None:
-        words += ["--conf-file", _relative(config_file(row.conf))]
-    if n_timesteps is not None:
-        words += ["-n", str(n_timesteps)]
-    if seeds.start:
-        words += ["--seed", str(seeds.start)]
-    words += ["--n-seeds", str(len(seeds))]
-    if logs != LOGS:
-        words += ["-f", str(logs)]
-    if row.params:
-        import yaml
-
-        words.append("-params")
-        for key, value in row.params.items():
-            text = yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)
-            words.append(f"{key}:{text.removesuffix(chr(10)).removesuffix('...').strip()}")
-    return shlex.join(words)
-
-
-def _relative(path: Path) -> str:
-    here = Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 def fits(run: Run, row: Row) -> bool:
@@ -243,7 +150,7 @@ class RunFinder:
         config = config_of_row(row)
         if not self._runs[row.algo]:
             return []
-        wanted = _method(config)
+        wanted = method_of(config)
         return [run for run in self._runs[row.algo] if run.method == wanted]
 
     def _rest(self, fitting: Iterable[Run], chosen: Sequence[Run]) -> str:

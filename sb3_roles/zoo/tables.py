@@ -18,7 +18,7 @@ from sb3_roles.zoo.machine import usable_cores
 from sb3_roles.zoo.options import UsageError, names_of, whole_number
 from sb3_roles.zoo.plans import read_plan_file
 from sb3_roles.zoo.ray_options import LOCAL, import_ray
-from sb3_roles.zoo.row_runs import LOGS, PLAN
+from sb3_roles.zoo.row_configs import LOGS, PLAN
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.crews import Crew
