@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ def observation_space(scene: Scene, sub_goal: str = "none", known_map: bool = Fa
 class TeamArrays:
     """All arrays of a batch, allocated once, and the kernels' arguments made of them.
 
-    :param scene: the task
+    :param scenes: the task; of several, each is played by an equal share of consecutive teams
     :param n_teams: number of teams
     :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the key ``known``, too
@@ -83,18 +84,20 @@ class TeamArrays:
 
     def __init__(
         self,
-        scene: Scene,
+        scenes: tuple[Scene, ...],
         n_teams: int,
         sub_goal: str,
         known_map: bool = False,
         n_threads: int = 1,
     ) -> None:
-        self.scene = scene
+        self.scenes = scenes
+        self._common = scenes[0]  # for what all scenes agree in
+        self._state_names = (*_STATE_ARRAYS, *(("scene_index",) if len(scenes) > 1 else ()))
         self.n_teams = n_teams
-        self.n_agents = scene.n_agents
+        self.n_agents = self._common.n_agents
         self.sub_goal = sub_goal
         self.known_map = False
-        self.observation_space = observation_space(scene, sub_goal)
+        self.observation_space = observation_space(self._common, sub_goal)
         self._started = False
         self._n_threads = n_threads
         self._allocate()
@@ -102,11 +105,12 @@ class TeamArrays:
             self.show_known_map()
 
     def _allocate(self) -> None:
-        scene, m, n = self.scene, self.n_teams, self.n_agents
+        scene, m, n = self._common, self.n_teams, self.n_agents
         self._border = layout.border_width(scene.view_radius, scene.sensor_radius)
         height, width = scene.height, scene.width
         padded = (height + 2 * self._border, width + 2 * self._border)
 
+        self.scene_index = np.arange(m) * len(self.scenes) // m
         self.keys = np.zeros((m, 2), np.uint64)
         self.episodes = np.zeros(m, np.int64)
         self.episode_stride = np.ones(m, np.int64)
@@ -153,7 +157,34 @@ class TeamArrays:
         # Without searches a step is over before another thread has begun.
         n_threads = 1 if self.sub_goal == "none" else self._n_threads
         parts = even_slices(self.n_teams, n_threads)
-        self._threads = SliceThreads([TeamSlice(self, part) for part in parts])
+        self._threads = SliceThreads([self._slices(part) for part in parts])
+
+    def _slices(self, teams: slice) -> list[TeamSlice]:
+        """Divide consecutive teams into runs of teams that play the same scene."""
+        changes = np.flatnonzero(np.diff(self.scene_index[teams])) + teams.start + 1
+        bounds = [teams.start, *changes.tolist(), teams.stop]
+        return [
+            TeamSlice(self, slice(start, stop), self.scene_of(start))
+            for start, stop in pairwise(bounds)
+        ]
+
+    @property
+    def scene(self) -> Scene:
+        """The task that all teams play.
+
+        :raises ValueError: if they play several, see :meth:`scene_of`
+        """
+        if len(self.scenes) > 1:
+            names = ", ".join(scene.name for scene in self.scenes)
+            raise ValueError(f"the teams play a mix of scenes ({names}), where one is needed")
+        return self._common
+
+    def scene_of(self, team: int) -> Scene:
+        """Return the scene that a team plays.
+
+        :param team: index of the team
+        """
+        return self.scenes[self.scene_index[team]]
 
     @property
     def n_threads(self) -> int:
@@ -178,10 +209,10 @@ class TeamArrays:
         if self.known_map:
             return
         self.known_map = True
-        self.observation_space = observation_space(self.scene, self.sub_goal, True)
+        self.observation_space = observation_space(self._common, self.sub_goal, True)
         self.team_observation_keys = (*self.team_observation_keys, "known")
-        size = (self.n_teams, self.scene.height, self.scene.width, len(layout.KNOWN_CHANNELS))
-        self._known = np.zeros(size, np.uint8)
+        size = (self._common.height, self._common.width, len(layout.KNOWN_CHANNELS))
+        self._known = np.zeros((self.n_teams, *size), np.uint8)
         self.observations["known"] = np.moveaxis(self._known, -1, -3)
         self.first_team["known"] = self.observations["known"][0]
         self._bind_kernels()
@@ -196,19 +227,21 @@ class TeamArrays:
 
         :return: plain arrays by name; :meth:`set_state` continues from them bit for bit
         """
-        return {name: getattr(self, name).copy() for name in _STATE_ARRAYS}
+        return {name: getattr(self, name).copy() for name in self._state_names}
 
     def set_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from a copy of the simulation, made by a batch of the same scene and size.
+        """Continue from a copy of the simulation, made by a batch of the same scenes and size.
+
+        Which team plays which scene of a mix is part of it.
 
         :param state: what :meth:`get_state` returned
         :raises ValueError: if an array is missing or unknown, or has another shape or type;
             nothing is changed then
         """
-        if set(state) != set(_STATE_ARRAYS):
-            wrong = sorted(set(state) ^ set(_STATE_ARRAYS))
+        if set(state) != set(self._state_names):
+            wrong = sorted(set(state) ^ set(self._state_names))
             raise ValueError(f"state does not fit: missing or unknown arrays {', '.join(wrong)}")
-        for name in _STATE_ARRAYS:
+        for name in self._state_names:
             have, want = np.asarray(state[name]), getattr(self, name)
             if have.shape != want.shape or have.dtype != want.dtype:
                 raise ValueError(
@@ -216,13 +249,19 @@ class TeamArrays:
                     f"got {have.dtype} of shape {have.shape}"
                 )
         position, roles = np.asarray(state["position"]), np.asarray(state["roles"])
-        if np.any(position < 0) or np.any(position >= (self.scene.height, self.scene.width)):
+        if np.any(position < 0) or np.any(position >= self._joint.shape[1:3]):
             raise ValueError("state does not fit: a position is not on the map")
         self._check_cells(np.asarray(state["cells"]), position)
         if np.any(roles < 0) or np.any(roles >= MAX_ROLES):
             raise ValueError(f"state does not fit: roles must be in 0..{MAX_ROLES - 1}")
-        for name in _STATE_ARRAYS:
+        index = np.asarray(state.get("scene_index", self.scene_index))
+        if np.any(index < 0) or np.any(index >= len(self.scenes)):
+            raise ValueError(f"state does not fit: scene_index must be below {len(self.scenes)}")
+        moved = np.any(index != self.scene_index)
+        for name in self._state_names:
             getattr(self, name)[:] = state[name]
+        if moved:
+            self._bind_kernels()
         self._started = True
         for m in range(self.n_teams):
             kernels.rebuild(
@@ -249,7 +288,7 @@ class TeamArrays:
     # Pickling (SuperSuit copies environments that way) would tear the views of one memory apart.
     def __getstate__(self) -> dict[str, Any]:
         options = {
-            "scene": self.scene,
+            "scene": self.scenes,
             "n_teams": self.n_teams,
             "sub_goal": self.sub_goal,
             "known_map": self.known_map,

@@ -15,7 +15,7 @@ from area_search.cells import N_ACTIONS
 from area_search.random_streams import seed_key
 from area_search.render import Window, draw_frame
 from area_search.rewards import MAX_ROLES, REWARD_COMPONENTS
-from area_search.scenes import Scene, get_scene, shown
+from area_search.scenes import Scene, get_scenes, shown
 from area_search.snapshot import Snapshot
 from area_search.team_slices import TeamSlice, check_threads
 
@@ -28,13 +28,14 @@ class BatchedAreaSearch(TeamArrays):
     All arrays are allocated once and overwritten by every step, the observations too: copy what
     must last. An episode is a function of (scene, seed, episode number) alone.
 
-    :param scene: a :class:`Scene` or the name of one
+    :param scene: a :class:`Scene` or the name of one; or a list of such, a mix, of which each is
+        played by an equal share of consecutive teams, see ``scenes.get_scenes``
     :param n_teams: number of teams
     :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``; which path features
         (``area_search.paths``) join the observation
     :param known_map: observe the team's map under the key ``known``, see :meth:`show_known_map`
     :param n_threads: threads that work on the teams of a step; it changes no result
-    :param scene_options: fields of the scene to change
+    :param scene_options: fields of the scene, or of all scenes, to change
     :raises ValueError: if an option is unknown or out of range
     """
 
@@ -43,7 +44,7 @@ class BatchedAreaSearch(TeamArrays):
 
     def __init__(
         self,
-        scene: Scene | str = "hard",
+        scene: Scene | str | Sequence[Scene | str] = "hard",
         n_teams: int = 1,
         sub_goal: str = "none",
         known_map: bool = False,
@@ -52,8 +53,8 @@ class BatchedAreaSearch(TeamArrays):
     ) -> None:
         if isinstance(n_teams, bool) or not isinstance(n_teams, int) or n_teams < 1:
             raise ValueError(f"n_teams must be a whole number of at least 1, got {n_teams!r}")
-        scene = get_scene(scene, **scene_options)
-        super().__init__(scene, n_teams, sub_goal, known_map, check_threads(n_threads))
+        scenes = get_scenes(scene, **scene_options)
+        super().__init__(scenes, n_teams, sub_goal, known_map, check_threads(n_threads))
         self.possible_agents = [f"robot_{i}" for i in range(self.n_agents)]
         self.action_space = spaces.Discrete(N_ACTIONS)
         self._window: Window | None = None
@@ -194,7 +195,7 @@ class BatchedAreaSearch(TeamArrays):
     def _metrics_so_far(self, team: int) -> dict[str, float]:
         """Metrics of the running episode; ``metrics`` are those of the last step."""
         values = np.zeros(len(kernels.METRICS))
-        scene = self.scene
+        scene = self.scene_of(team)
         kernels.measure(self.totals[team], scene.n_free, scene.n_targets, values)
         return dict(zip(kernels.METRICS, values.tolist(), strict=True))
 
@@ -227,7 +228,7 @@ class BatchedAreaSearch(TeamArrays):
         :param extra: fields of :class:`~area_search.render.Snapshot` to add or replace
         :return: the snapshot, made of copies
         """
-        b, scene = self._border, self.scene
+        b, scene = self._border, self.scene_of(team)
         board = self.cells[team, b:-b, b:-b]
         values: dict[str, Any] = {
             "obstacle": (board & layout.OBSTACLE) > 0,

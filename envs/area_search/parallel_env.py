@@ -13,7 +13,7 @@ from area_search import kernels
 from area_search.batch import BatchedAreaSearch
 from area_search.render import Window, draw_frame
 from area_search.rewards import REWARD_COMPONENTS
-from area_search.scenes import Scene, get_scene, shown, unknown
+from area_search.scenes import Scene, shown, unknown
 
 ObsDict = dict[str, dict[str, np.ndarray]]
 InfoDict = dict[str, dict[str, Any]]
@@ -40,7 +40,8 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
     * **End**: all robots are truncated together at ``scene.horizon``; with
       ``early_stop_patience`` all are terminated once one of them has found nothing for long.
 
-    :param scene: a :class:`Scene` or the name of one
+    :param scene: a :class:`Scene` or the name of one; a list of such, a mix, can be played by
+        several teams alone, see :meth:`batched`
     :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the team's map, too
     :param render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a pygame window)
@@ -60,7 +61,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
 
     def __init__(
         self,
-        scene: Scene | str = "hard",
+        scene: Scene | str | Sequence[Scene | str] = "hard",
         sub_goal: str = "none",
         render_mode: str | None = None,
         known_map: bool = False,
@@ -69,10 +70,10 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             allowed = self.metadata["render_modes"]
             raise ValueError(unknown("render_mode", render_mode, allowed))
-        self.scene = get_scene(scene, **scene_options)
         self.sub_goal = sub_goal
         self.render_mode = render_mode
-        self._batch = BatchedAreaSearch(self.scene, 1, sub_goal, known_map)
+        self._batch = BatchedAreaSearch(scene, 1, sub_goal, known_map, **scene_options)
+        self.scenes = self._batch.scenes
         self.team_observation_keys = self._batch.team_observation_keys
         self.possible_agents = list(self._batch.possible_agents)
         self.agents: list[str] = []
@@ -93,6 +94,11 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         return self._action_space
 
     @property
+    def scene(self) -> Scene:
+        """The task; an error if it is a mix of scenes."""
+        return self._batch.scene
+
+    @property
     def state_space(self) -> spaces.Space:
         """The space of :meth:`state`."""
         return self._space["state"]
@@ -107,7 +113,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
 
         :param n_teams: number of teams
         """
-        return BatchedAreaSearch(self.scene, n_teams, self.sub_goal, self._batch.known_map)
+        return BatchedAreaSearch(self.scenes, n_teams, self.sub_goal, self._batch.known_map)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -118,8 +124,15 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
             of the current stream, or a random stream at the first reset
         :param options: ``{"episode": k}`` starts episode k of the seed's stream instead
         :return: observations and empty infos per robot
-        :raises ValueError: if the seed or an option is unknown or out of range
+        :raises ValueError: if the seed or an option is unknown or out of range, or the scene is a
+            mix
         """
+        if len(self.scenes) > 1:
+            names = ", ".join(scene.name for scene in self.scenes)
+            raise ValueError(
+                f"one team can not play a mix of scenes ({names}): take the native backend, which "
+                "plays many teams together, or one scene"
+            )
         options = dict(options or {})
         episode = options.pop("episode", None)
         options.pop("options", None)  # what PettingZoo's own API test passes
@@ -258,7 +271,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         """
         if self.render_mode is None:
             return None
-        earlier = np.array(self._path[:-1], np.int32).reshape(-1, self.scene.n_agents, 2)
+        earlier = np.array(self._path[:-1], np.int32).reshape(-1, len(self.possible_agents), 2)
         frame = draw_frame(
             self._batch.snapshot(0, roles=self._roles, role_names=self._role_names, path=earlier)
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
 from typing import Any
@@ -15,6 +16,16 @@ MAX_SENSOR_RADIUS = 32
 MAX_VIEW_RADIUS = 32
 MAX_HORIZON = 1_000_000
 REWARD_SHARING = ("own", "same_role")
+# What the teams of one batch have in common: the shapes of arrays, and who hears whom.
+_SHARED = (
+    "height",
+    "width",
+    "n_agents",
+    "sensor_radius",
+    "view_radius",
+    "communication_radius",
+    "horizon",
+)
 
 
 class SceneError(ValueError):
@@ -212,3 +223,31 @@ def get_scene(scene: str | Scene, **options: Any) -> Scene:
     elif not isinstance(scene, Scene):
         raise SceneError(f"scene must be a name or a Scene, got {type(scene).__name__}")
     return scene.with_options(**options) if options else scene
+
+
+def get_scenes(scenes: str | Scene | Sequence[str | Scene], **options: Any) -> tuple[Scene, ...]:
+    """Look up the scenes of a batch: one, or a mix of several.
+
+    :param scenes: what :func:`get_scene` takes, or a list of such; the scenes of a list must have
+        different names, and the same map size, robots, sensor, view, communication and horizon
+    :param options: fields to change in each of them
+    :return: at least one
+    :raises SceneError: if one is unknown or out of range, or they do not go together
+    """
+    if isinstance(scenes, (str, Scene)) or not isinstance(scenes, Sequence):
+        return (get_scene(scenes, **options),)
+    found = tuple(get_scene(scene, **options) for scene in scenes)
+    if not found:
+        raise SceneError("a mix of scenes must have at least one, got none")
+    first, names = found[0], [scene.name for scene in found]
+    for k, scene in enumerate(found):
+        if scene.name in names[:k]:
+            raise SceneError(f"a mix of scenes must have each of them once, got {scene.name} twice")
+        for field in _SHARED:
+            values = getattr(first, field), getattr(scene, field)
+            if values[0] != values[1]:
+                raise SceneError(
+                    f"scenes of a mix must agree in {field}: it is {values[0]} in {first.name}, "
+                    f"{values[1]} in {scene.name}"
+                )
+    return found

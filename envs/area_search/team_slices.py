@@ -19,6 +19,7 @@ from area_search import cells as layout
 
 if TYPE_CHECKING:
     from area_search.arrays import TeamArrays
+    from area_search.scenes import Scene
 
 
 def check_threads(n_threads: int) -> int:
@@ -47,11 +48,12 @@ class TeamSlice:
 
     :param arrays: the batch; its arrays must be overwritten, never replaced
     :param teams: which ones
+    :param scene: what they play
     """
 
-    def __init__(self, arrays: TeamArrays, teams: slice) -> None:
+    def __init__(self, arrays: TeamArrays, teams: slice, scene: Scene) -> None:
         self.teams = teams
-        scene, border = arrays.scene, arrays._border
+        border = arrays._border
         discs = layout.disc_offsets(scene.sensor_radius)
         edges, edge_counts = layout.edge_offsets(discs)
 
@@ -175,28 +177,33 @@ class TeamSlice:
 
 
 class SliceThreads:
-    """Works on slices at once, the first one in the calling thread.
+    """Works on slices at once, the first share of them in the calling thread.
 
-    :param slices: at least one
+    :param shares: the slices of each thread, at least one thread
     """
 
-    def __init__(self, slices: list[TeamSlice]) -> None:
-        self.slices = slices
+    def __init__(self, shares: list[list[TeamSlice]]) -> None:
+        self.shares = shares
         self._pool: ThreadPoolExecutor | None = None
         self._owner = 0
 
     def run(self, work: Callable[[TeamSlice], None]) -> None:
         """Work on all slices, and wait for the last."""
-        first, *others = self.slices
+
+        def work_on(share: list[TeamSlice]) -> None:
+            for one in share:
+                work(one)
+
+        first, *others = self.shares
         if not others:
-            work(first)
+            work_on(first)
             return
         # A forked process has none of its parent's threads.
         if self._pool is None or self._owner != os.getpid():
             self._pool, self._owner = ThreadPoolExecutor(len(others), "teams"), os.getpid()
-        running = [self._pool.submit(work, other) for other in others]
+        running = [self._pool.submit(work_on, other) for other in others]
         try:
-            work(first)
+            work_on(first)
         finally:
             wait(running)
         for one in running:

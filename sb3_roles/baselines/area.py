@@ -8,14 +8,28 @@ from area_search.scenes import Scene
 from sb3_roles.common.team_wrapper import find_team_env
 
 
-def area_scene(env: VecEnv | None) -> Scene | None:
-    """Return the scene of an area-search environment, below any wrappers; None of another one.
+def area_scenes(env: VecEnv | None) -> tuple[Scene, ...]:
+    """Return the scenes of an area-search environment, below any wrappers; none of another one.
 
     :param env: a vectorized environment of teams
     :raises ValueError: if its rows are not those of a ``TeamVecEnv``
     """
     try:
-        scene = find_team_env(env).get_attr("scene", [0])[0]
+        scenes = find_team_env(env).get_attr("scenes", [0])[0]
     except AttributeError:
-        return None
-    return scene if isinstance(scene, Scene) else None
+        return ()
+    of_area = isinstance(scenes, tuple) and all(isinstance(scene, Scene) for scene in scenes)
+    return scenes if of_area else ()
+
+
+def area_scene(env: VecEnv | None) -> Scene | None:
+    """Return the scene of an area-search environment, below any wrappers; None of another one.
+
+    :param env: a vectorized environment of teams
+    :raises ValueError: if its teams play several, or its rows are not those of a ``TeamVecEnv``
+    """
+    scenes = area_scenes(env)
+    if len(scenes) > 1:
+        names = ", ".join(scene.name for scene in scenes)
+        raise ValueError(f"the teams play a mix of scenes ({names}), where one is needed")
+    return scenes[0] if scenes else None

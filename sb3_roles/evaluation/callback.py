@@ -143,7 +143,9 @@ class EvaluationCallback(TeamCallback):
         self.history.append({**steps, **scores})
         value = scores[self.metric]
         if self.verbose > 0:
-            print(f"evaluation at {self.joint_steps} joint steps: {self.metric} {value:.4g}")
+            note = getattr(self.evaluate, "note", "")
+            note = f" ({note})" if note else ""
+            print(f"evaluation at {self.joint_steps} joint steps: {self.metric} {value:.4g}{note}")
         # Not ">=": of equal ones the first. A NaN is never the best.
         if np.isfinite(value) and (self.best is None or value > self.best):
             self.best = value

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from area_search.scenes import Scene, get_scene
-from sb3_roles.baselines.area import area_scene
+from sb3_roles.baselines.area import area_scenes
 from sb3_roles.common.callbacks import Evaluate
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.common.thresholds import first_above
@@ -33,6 +33,9 @@ class SceneEvaluator:
     :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
     :raises ValueError: if there is no such stream
     """
+
+    note = ""
+    """What a printed score says beside its number."""
 
     def __init__(
         self,
@@ -80,6 +83,50 @@ class SceneEvaluator:
         """Nothing is open."""
 
 
+class MixEvaluator:
+    """Plays equal numbers of episodes of several scenes, see :class:`SceneEvaluator`.
+
+    :param scenes: at least two, of different names
+    :param n_episodes: team episodes of all scenes together, rounded up to equal shares
+    :param seed: of the stream; the scenes share the numbers of its episodes
+    :param deterministic: see :class:`SceneEvaluator`
+    :param stream: see there
+    :raises ValueError: if there is no such stream
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        n_episodes: int = 100,
+        seed: int = 0,
+        deterministic: bool = True,
+        stream: str = "held_out",
+    ) -> None:
+        share = -(-n_episodes // len(scenes))
+        self._parts = {
+            scene.name: SceneEvaluator(scene, share, seed, deterministic, stream=stream)
+            for scene in scenes
+        }
+        self.note = f"mean of {', '.join(self._parts)}"
+
+    def __call__(self, model: BaseAlgorithm) -> dict[str, float]:
+        """Play the episodes.
+
+        :param model: any SB3 model
+        :return: ``explo_paper``, ``explo_true``, ``cover`` and ``t90_share``, means over the
+            scenes; ``cover_<scene>`` of each scene; and ``n_episodes``, of all
+        """
+        scores = {name: evaluate(model) for name, evaluate in self._parts.items()}
+        names = ("explo_paper", "explo_true", "cover", "t90_share")
+        means = {name: float(np.mean([one[name] for one in scores.values()])) for name in names}
+        covers = {f"cover_{scene}": one["cover"] for scene, one in scores.items()}
+        total = sum(one["n_episodes"] for one in scores.values())
+        return {**means, **covers, "n_episodes": total}
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
 class VecEnvEvaluator:
     """Plays team episodes of any environment, always the same ones.
 
@@ -95,6 +142,8 @@ class VecEnvEvaluator:
     :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
     :raises ValueError: if there is no such stream
     """
+
+    note = ""
 
     def __init__(
         self,
@@ -168,13 +217,34 @@ def make_evaluator(
     :param seed: of the stream
     :param deterministic: take the likeliest actions
     :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
-    :return: a :class:`SceneEvaluator`
+    :return: see :func:`scenes_evaluator`
     :raises ValueError: if the environment is another one, or there is no such stream
     """
-    scene = area_scene(model.env)
-    if scene is None:
+    scenes = area_scenes(model.env)
+    if not scenes:
         raise ValueError(
             "the environment is not area search: evaluate on a second one, with "
             "EvaluationCallback(evaluate=VecEnvEvaluator(env, stream='selection'))"
         )
-    return SceneEvaluator(scene, n_episodes, seed, deterministic, stream=stream)
+    return scenes_evaluator(scenes, n_episodes, seed, deterministic, stream)
+
+
+def scenes_evaluator(
+    scenes: Sequence[Scene],
+    n_episodes: int = 100,
+    seed: int = 0,
+    deterministic: bool = True,
+    stream: str = "held_out",
+) -> SceneEvaluator | MixEvaluator:
+    """Make the evaluation on one scene, or on each scene of a mix.
+
+    :param scenes: at least one
+    :param n_episodes: team episodes
+    :param seed: of the stream
+    :param deterministic: take the likeliest actions
+    :param stream: ``"held_out"``, to measure a policy, or ``"selection"``, to select one
+    :raises ValueError: if there is no such stream
+    """
+    if len(scenes) == 1:
+        return SceneEvaluator(scenes[0], n_episodes, seed, deterministic, stream=stream)
+    return MixEvaluator(scenes, n_episodes, seed, deterministic, stream)

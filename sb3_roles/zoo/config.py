@@ -20,7 +20,7 @@ from sb3_roles.zoo.config_checks import (
     config_problems,
     links_robots,
 )
-from sb3_roles.zoo.environments import scene_of_run
+from sb3_roles.zoo.environments import scenes_of_run
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ranges import problems
 
@@ -199,7 +199,7 @@ def resolve(
     if found:
         raise ConfigError(found)
     if links_robots(config):
-        radius = scene_of_run(config).communication_radius
+        radius = scenes_of_run(config)[0].communication_radius
         config["policy_kwargs"] = {**config["policy_kwargs"], RADIUS: radius}
     return config
 

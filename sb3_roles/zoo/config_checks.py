@@ -13,7 +13,7 @@ from sb3_roles.zoo.environments import (
     GOAL_SETS,
     REWARD_COMPONENTS,
     env_problems,
-    scene_of_run,
+    scenes_of_run,
 )
 from sb3_roles.zoo.options import MAX_TRAINING_SEED
 from sb3_roles.zoo.ranges import Choice, Items, Range, Text, Weights, Whole, problems
@@ -138,8 +138,10 @@ def _together(config: Mapping[str, Any]) -> list[str]:
     if config["env"] != AREA_SEARCH:
         return found
     env_kwargs, policy_kwargs = config["env_kwargs"], config["policy_kwargs"]
+    found += _mix_problems(config, len(scenes_of_run(config)))
     if links_robots(config) and RADIUS in policy_kwargs:
-        given, radius = policy_kwargs[RADIUS], scene_of_run(config).communication_radius
+        # Scenes of a mix agree in it.
+        given, radius = policy_kwargs[RADIUS], scenes_of_run(config)[0].communication_radius
         if given != radius:
             found.append(
                 f"policy_kwargs.{RADIUS} must be the environment's, {radius:g}, got {given}: "
@@ -159,6 +161,25 @@ def _together(config: Mapping[str, Any]) -> list[str]:
             if key in env_kwargs
         ]
         found += _goal_problems(config)
+    return found
+
+
+def _mix_problems(config: Mapping[str, Any], n_scenes: int) -> list[str]:
+    if n_scenes == 1:
+        return []
+    found = []
+    if ALGORITHMS[config["algo"]].clones:
+        found.append(f"env_kwargs.scene must be one scene for {config['algo']}, got {n_scenes}")
+    if config["vec_env"] == "supersuit":
+        found.append(
+            f"env_kwargs.scene must be one scene with vec_env supersuit, got {n_scenes}: the "
+            "native one divides its teams over a mix"
+        )
+    if config["n_envs"] < n_scenes:
+        found.append(
+            f"n_envs must be at least the number of scenes, {n_scenes}, got {config['n_envs']}: "
+            "each is played by a team of its own"
+        )
     return found
 
 

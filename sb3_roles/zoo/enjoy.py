@@ -206,18 +206,21 @@ def _episodes(
     controller: PolicyController, config: Mapping[str, Any], args: Namespace, show: Show | None
 ) -> Iterator[tuple[dict[str, float], np.ndarray]]:
     from sb3_roles.common.team_vec_env import team_seeds
-    from sb3_roles.zoo.environments import env_factory, scene_of_run
+    from sb3_roles.zoo.environments import env_factory, scenes_of_run
     from sb3_roles.zoo.playback import play_env, play_scene
 
     try:
         if config["env"] == AREA_SEARCH:
             from sb3_roles.evaluation.episodes import held_out_seed
 
-            scene, links = scene_of_run(config), bool(controller.communicate)
+            scenes, links = scenes_of_run(config), bool(controller.communicate)
+            if len(scenes) > 1:
+                names = ", ".join(scene.name for scene in scenes)
+                raise UsageError(f"the run was trained on a mix ({names}): add --scene NAME")
             # The episodes that `evaluate --seed` scores.
             seed = held_out_seed(args.seed)
             for episode in range(args.episodes):
-                yield play_scene(controller, scene, seed, episode, show, links)
+                yield play_scene(controller, scenes[0], seed, episode, show, links)
             return
         drawn = {} if show is None else {"render_mode": "rgb_array"}
         env = env_factory(config["env"], {**config["env_kwargs"], **drawn})()

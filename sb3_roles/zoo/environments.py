@@ -9,14 +9,11 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from area_search.scenes import SCENES, SceneError, get_scene
+from area_search.scenes import SCENES, Scene, SceneError, get_scenes
 from sb3_roles.common.names import closest
 from sb3_roles.zoo.options import UsageError
-
-if TYPE_CHECKING:
-    from area_search.scenes import Scene
 
 AREA_SEARCH = "area-search-v0"
 ENVIRONMENTS: dict[str, str] = {AREA_SEARCH: "area_search:AreaSearchEnv"}
@@ -47,9 +44,11 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
         found.append(f"env_kwargs: known_map must be true or false, got {known_map!r}")
     if sub_goal not in SUB_GOALS:
         found.append(f"env_kwargs: {closest('sub_goal', sub_goal, SUB_GOALS)}")
-    if not isinstance(name, str) or name not in SCENES:
-        return [*found, f"env_kwargs: {closest('scene', name, SCENES)}"]
-    known = [field.name for field in fields(SCENES[name]) if field.name != "name"]
+    names_of_scenes = name if isinstance(name, list) else [name]
+    for one in names_of_scenes:
+        if not isinstance(one, str) or one not in SCENES:
+            return [*found, f"env_kwargs: {closest('scene', one, SCENES)}"]
+    known = [field.name for field in fields(Scene) if field.name != "name"]
     for key in options:
         if key not in known:
             names = ["scene", "sub_goal", "known_map", *known]
@@ -58,18 +57,17 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
     for key, value in options.items():
         if key in known:
             try:
-                get_scene(name, **{key: value})
+                get_scenes(name, **{key: value})
             except SceneError as error:
                 single.append(f"env_kwargs: {error}")
-    if not found and not single:
-        return []
     try:
         # Together they may fit what none of them fits alone: more targets on a larger map.
-        get_scene(name, **{key: value for key, value in options.items() if key in known})
+        get_scenes(name, **{key: value for key, value in options.items() if key in known})
         single = []
     except SceneError as error:
         single = single or [f"env_kwargs: {error}"]
-    return found + single
+    # Each key on its own finds what is wrong with a mix.
+    return found + list(dict.fromkeys(single))
 
 
 def check_named(where: object, env: str, named: str | None) -> None:
@@ -92,15 +90,15 @@ def check_named(where: object, env: str, named: str | None) -> None:
         )
 
 
-def scene_of_run(config: Mapping[str, Any]) -> Scene:
-    """Return the scene of a configuration for area search.
+def scenes_of_run(config: Mapping[str, Any]) -> tuple[Scene, ...]:
+    """Return the scenes of a configuration for area search: one, or those of a mix.
 
     :param config: a checked configuration
     """
     options = dict(config["env_kwargs"])
     options.pop("sub_goal", None)
     options.pop("known_map", None)
-    return get_scene(options.pop("scene", "hard"), **options)
+    return get_scenes(options.pop("scene", "hard"), **options)
 
 
 def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:

@@ -29,10 +29,15 @@ from sb3_roles.common.names import one_line
 from sb3_roles.common.progress_callback import TeamProgressBar
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.evaluation.callback import EvaluationCallback
-from sb3_roles.evaluation.evaluators import SceneEvaluator, VecEnvEvaluator
+from sb3_roles.evaluation.evaluators import (
+    MixEvaluator,
+    SceneEvaluator,
+    VecEnvEvaluator,
+    scenes_evaluator,
+)
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
-from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scene_of_run
+from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
 from sb3_roles.zoo.models import check_device, complete, make_env, make_model, steps_of
 from sb3_roles.zoo.options import UsageError
@@ -273,7 +278,7 @@ def _logger(
 
 def make_evaluate(
     config: Mapping[str, Any], n_episodes: int, seed: int, stream: str = "held_out"
-) -> SceneEvaluator | VecEnvEvaluator:
+) -> SceneEvaluator | MixEvaluator | VecEnvEvaluator:
     """Make what evaluates a model on episodes of its task that no training plays.
 
     :param config: checked
@@ -283,7 +288,7 @@ def make_evaluate(
     :return: a function of the model; to be closed
     """
     if config["env"] == AREA_SEARCH:
-        return SceneEvaluator(scene_of_run(config), n_episodes, seed, stream=stream)
+        return scenes_evaluator(scenes_of_run(config), n_episodes, seed, stream=stream)
     env = make_env(config, min(_MAX_EVAL_TEAMS, n_episodes))
     return VecEnvEvaluator(env, n_episodes, seed, stream=stream)
 
@@ -293,6 +298,8 @@ def _evaluate(
 ) -> None:
     with closing(make_evaluate(config, n_episodes, _FINAL_SEED)) as evaluate:
         scores = evaluate(model)
+    # A mix rounds them up to equal shares.
+    n_episodes = int(scores["n_episodes"])
     about = {"episodes": n_episodes, "stream": "held_out", "seed": _FINAL_SEED}
     write_yaml(run / "evaluation.yml", {**about, "scores": dict(scores)})
     shown = ("explo_paper", "explo_true", "cover")
@@ -300,7 +307,8 @@ def _evaluate(
         text = ", ".join(f"{name} {100 * scores[name]:.1f} %" for name in shown)
     else:
         text = ", ".join(f"{name} {value:.4g}" for name, value in scores.items())
-    print(f"{n_episodes} held-out episodes of seed {_FINAL_SEED}: {text}", flush=True)
+    note = f", {evaluate.note}" if evaluate.note else ""
+    print(f"{n_episodes} held-out episodes of seed {_FINAL_SEED}{note}: {text}", flush=True)
 
 
 def _print_start(
