@@ -9,7 +9,7 @@ import pytest
 from helpers import DOWN, LEFT, RIGHT, STOP, UP, hand_made
 
 from area_search import BatchedAreaSearch, Scene
-from area_search.look_ahead_data import CHANCES, DEPTH, DISCOUNT
+from area_search.look_ahead_data import CHANCES, DEPTH, discount_at, unseen_worths
 from sb3_roles.baselines import controller_class
 from sb3_roles.evaluation.episodes import run_episodes
 
@@ -29,6 +29,10 @@ def check(got, moves, steps, worth=None):
     assert got[5] == pytest.approx(0.0 if steps is None else 0.9**steps, rel=1e-6)
     for move, expected in (worth or {}).items():
         assert got[6 + move] == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+# Hand-made episodes have just begun.
+DISCOUNT = discount_at(Scene().horizon)
 
 
 def late(*steps):
@@ -106,7 +110,7 @@ def test_unseen_cells_are_worth_the_targets_to_be_expected():
     density = batch.scene.n_targets / batch.scene.n_free
     check(got, [RIGHT], 2)
     # Worths are rounded to 1 / 1024 of a target.
-    expected = density * CHANCES[2] * late(2, 3)
+    expected = unseen_worths(density, batch.scene.horizon)[2] * late(2, 3)
     assert got[6 + RIGHT] == pytest.approx(expected, abs=late(2, 3) / 2048 + 1e-5)
 
 

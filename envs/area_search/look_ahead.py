@@ -4,9 +4,11 @@ A route is a sequence of moves over known free cells. It is worth what it covers
 much less as it comes later: a known target counts 1, an unseen cell as many targets as may be
 expected on it. A robot looks for the route worth most; what a team mate's route gets earlier counts
 only by the time that it comes sooner, so that the worths of a team's routes add up. Robots plan one
-after the other, and once more in the light of what all others plan.
+after the other, and once more in the light of what all others plan; of the plans that different
+robots begin, the best one counts.
 
-Nothing is kept from one step to the next: routes are a function of the map and the positions.
+Nothing is kept from one step to the next: routes are a function of the map, the positions and the
+number of steps left.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from area_search.look_ahead_data import (
     Marks,
     Routes,
     Rules,
+    Timetable,
+    rules_at,
 )
 from area_search.look_ahead_search import forget, keep, search
 from area_search.paths import encode
@@ -79,6 +83,62 @@ def _release(i: int, sees: bool, disc: np.ndarray, routes: Routes, marks: Marks)
 
 
 @njit(cache=True)
+def _settle(
+    cells: np.ndarray, target: int, sees: bool, rules: Rules, routes: Routes, marks: Marks
+) -> int:
+    """Return what the routes of a team are worth together; all claims are free then."""
+    claims, unseen = marks.claims, marks.unseen
+    total = 0
+    for i in range(routes.lengths.shape[0]):
+        for k in range(routes.lengths[i]):
+            cell = routes.cells[i, k]
+            if cells[cell] & KNOWN_TARGET:
+                total += target * claims[cell]
+                claims[cell] = 0
+            if sees and marks.sight[cell] > 0:
+                for q in range(rules.disc.shape[0]):
+                    seen = cell + rules.disc[q]
+                    if unseen[seen] > 0:
+                        total += unseen[seen] * claims[seen]
+                        claims[seen] = 0
+    return total
+
+
+@njit(cache=True)
+def _plan_in_turn(
+    first: int,
+    cells: np.ndarray,
+    starts: np.ndarray,
+    target: int,
+    sees: bool,
+    rules: Rules,
+    marks: Marks,
+    labels: Labels,
+    routes: Routes,
+) -> int:
+    """Plan one after the other, a given robot first; return what all routes are worth together."""
+    n_agents = starts.shape[0]
+    routes.lengths[:] = 0
+    for turn in range(rules.rounds * n_agents):
+        i = (first + turn) % n_agents
+        if turn >= n_agents:
+            if not routes.robbed[i]:
+                continue
+            for j in range(n_agents):
+                _release(j, sees, rules.disc, routes, marks)
+            for j in range(n_agents):
+                if j != i:
+                    _claim(cells, j, target, sees, rules, routes, marks)
+        routes.robbed[i] = False
+        n_labels, top = search(cells, starts[i], target, sees, 1, rules, marks, labels)
+        if top == 0:
+            n_labels, top = search(cells, starts[i], target, sees, 0, rules, marks, labels)
+        keep(i, n_labels, top, labels, routes)
+        _claim(cells, i, target, sees, rules, routes, marks)
+    return _settle(cells, target, sees, rules, routes, marks)
+
+
+@njit(cache=True)
 def plan_routes(
     cells: np.ndarray,
     starts: np.ndarray,
@@ -99,26 +159,16 @@ def plan_routes(
     :param routes: overwritten; a robot for which team mates leave nothing plans as if it were
         alone, and if nothing can be reached its route is empty
     """
-    n_agents = starts.shape[0]
-    routes.lengths[:] = 0
-    for turn in range(rules.rounds * n_agents):
-        i = turn % n_agents
-        if turn >= n_agents:
-            if not routes.robbed[i]:
-                continue
-            for j in range(n_agents):
-                _release(j, sees, rules.disc, routes, marks)
-            for j in range(n_agents):
-                if j != i:
-                    _claim(cells, j, target, sees, rules, routes, marks)
-        routes.robbed[i] = False
-        n_labels, top = search(cells, starts[i], target, sees, 1, rules, marks, labels)
-        if top == 0:
-            n_labels, top = search(cells, starts[i], target, sees, 0, rules, marks, labels)
-        keep(i, n_labels, top, labels, routes)
-        _claim(cells, i, target, sees, rules, routes, marks)
-    for j in range(n_agents):
-        _release(j, sees, rules.disc, routes, marks)
+    n_orders = min(rules.orders, starts.shape[0])
+    best_total, best = -1, 0
+    for order in range(n_orders):
+        # The plan that is begun by the first robot comes last: often it needs no other.
+        first = n_orders - 1 - order
+        total = _plan_in_turn(first, cells, starts, target, sees, rules, marks, labels, routes)
+        if total >= best_total:
+            best_total, best = total, first
+    if best > 0:
+        _plan_in_turn(best, cells, starts, target, sees, rules, marks, labels, routes)
 
 
 @njit(cache=True, nogil=True)
@@ -127,7 +177,8 @@ def route_goals(
     cells: np.ndarray,
     border: int,
     position: np.ndarray,
-    rules: Rules,
+    steps: np.ndarray,
+    timetable: Timetable,
     marks: Marks,
     labels: Labels,
     routes: Routes,
@@ -140,6 +191,7 @@ def route_goals(
     :param which: bool (n_teams,), the teams to write
     :param cells: uint8 (n_teams, height + 2 border, width + 2 border)
     :param position: int32 (n_teams, n_agents, 2)
+    :param steps: int32 (n_teams,), steps of the episodes so far
     :param starts: int64 (n_agents,), scratch
     :param table: int64, see :func:`~area_search.paths.discount_table`
     :param out: float32 (n_teams, n_agents, rows, 11); the last row is overwritten: five flags of
@@ -152,6 +204,7 @@ def route_goals(
             continue
         flat = cells[m].reshape(-1)
         place(cells.shape[2], border, position[m], starts)
+        rules = rules_at(timetable, timetable.rules.left - steps[m])
         plan_routes(flat, starts, TARGET_WORTH, True, rules, marks, labels, routes)
         forget(marks)
         for i in range(position.shape[1]):

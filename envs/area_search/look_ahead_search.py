@@ -69,12 +69,12 @@ def search(
     best, slot, claims = labels.best, labels.slot, marks.claims
     sights, unseen, offsets = marks.sight, marks.unseen, rules.offsets
     edges, edge_counts, discounts = rules.edges, rules.edge_counts, rules.discounts
-    depth, slack = rules.depth, rules.slack
+    depth, slack, left = rules.depth, rules.slack, rules.left
     cell_of[0], value_of[0], parent_of[0], first_of[0] = start, 0, NONE, 0
     best[start], slot[start] = 0, 0
     low, high, top, top_value, t = 0, 1, 0, 0, 0
     last = discounts.shape[0] - 1
-    while low < high and (t < depth or top_value == 0):
+    while low < high and t < left and (t < depth or top_value == 0):
         t += 1
         discount = discounts[min(t, last)]
         hopeless = top_value - slack * discount

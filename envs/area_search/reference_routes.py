@@ -20,9 +20,9 @@ _FINEST = 1 << 20
 
 
 @cache
-def discount(steps: int) -> int:
+def discount(steps: int, left: int) -> int:
     """What is left of a worth after some steps, in fixed point, never nothing."""
-    return max(1, round(float(np.float64(constants.DISCOUNT) ** steps) * _FINEST))
+    return max(1, round(float(np.float64(constants.discount_at(left)) ** steps) * _FINEST))
 
 
 @dataclass
@@ -44,6 +44,7 @@ class TeamMap:
     :param unexplored: cells of the map that nobody has seen
     :param disc: the cells of the map that a robot senses from a cell
     :param density: expected targets per free cell
+    :param left: steps left of the episode
     """
 
     ground: set[Cell]
@@ -51,14 +52,15 @@ class TeamMap:
     unexplored: set[Cell]
     disc: Callable[[Cell], set[Cell]]
     density: float
+    left: int
     known_gains: dict[tuple[Cell, Cell], dict[Cell, int]] = field(default_factory=dict)
 
     def unseen_worth(self, cell: Cell) -> int:
         """Return the worth of an unseen cell; off the map all is known to be obstacles."""
         beside = [(cell[0] + dr, cell[1] + dc) for dr, dc in MOVES[1:]]
         obstacles = sum(c not in self.ground and c not in self.unexplored for c in beside)
-        worth = float(np.float64(constants.CHANCES[obstacles]) * self.density * _UNIT)
-        return max(1, round(worth))
+        worth = constants.unseen_worths(self.density, self.left)[obstacles] * _UNIT
+        return max(1, round(float(worth)))
 
     def gains(self, before: Cell, cell: Cell) -> dict[Cell, int]:
         """Return what a move gets: the worth of a target, and of the cells that come into view."""
@@ -79,9 +81,10 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
     """
     labels, layer = [Label([start])], [Label([start])]
     best, top, t = {start: 0}, labels[0], 0
-    while layer and (t < constants.DEPTH or top.value == 0):
+    while layer and t < known.left and (t < constants.DEPTH or top.value == 0):
         t += 1
-        hopeless = top.value - int(constants.SLACK * _UNIT) * discount(t)
+        present = discount(t, known.left)
+        hopeless = top.value - int(constants.SLACK * _UNIT) * present
         following: dict[Cell, Label] = {}
         for label in layer:
             if label.value < hopeless:
@@ -93,7 +96,7 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
                     continue
                 value = label.value
                 for got, worth in known.gains(before, cell).items():
-                    value += worth * max(0, discount(t) - claims.get(got, (0, 0))[0])
+                    value += worth * max(0, present - claims.get(got, (0, 0))[0])
                 if value > label.value and cell in label.path:
                     value = label.value
                     if value <= best[cell]:
@@ -116,18 +119,20 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
 
 
 class TeamRoutes:
-    """Routes of all robots of a team.
+    """Routes of all robots of a team, planned in turn.
 
     :param known: the map
     :param robots: cells of the robots
+    :param begin: the robot that plans first
     """
 
-    def __init__(self, known: TeamMap, robots: list[Cell]) -> None:
+    def __init__(self, known: TeamMap, robots: list[Cell], begin: int) -> None:
         self.known = known
         self.found: list[list[Label]] = [[] for _ in robots]
         self.robbed: set[int] = set()
+        order = [(begin + k) % len(robots) for k in range(len(robots))]
         for turn in range(constants.ROUNDS):
-            for i, robot in enumerate(robots):
+            for i in order:
                 if turn > 0 and i not in self.robbed:
                     continue
                 claims: dict[Cell, tuple[int, int]] = {}
@@ -135,23 +140,34 @@ class TeamRoutes:
                     if j != i and self.found[j]:
                         self.claim(j, claims)
                 self.robbed.discard(i)
-                self.found[i] = search(known, robot, claims)
+                self.found[i] = search(known, robots[i], claims)
                 if self.found[i][0].value == 0:
-                    self.found[i] = search(known, robot, {})
+                    self.found[i] = search(known, robots[i], {})
                 self.claim(i, claims)
 
     def claim(self, i: int, claims: dict[Cell, tuple[int, int]]) -> None:
         """Claim what a robot's route gets, and note who gets less by that."""
+        left = self.known.left
         path = self.found[i][0].path
         for t, cell in enumerate(path[1:], start=1):
             for got in ({cell} & self.known.targets) | (
                 self.known.disc(cell) & self.known.unexplored
             ):
                 owned, owner = claims.get(got, (0, i))
-                if owned < discount(t):
-                    if owner != i and owned >= discount(constants.FIRM):
+                if owned < discount(t, left):
+                    if owner != i and owned >= discount(constants.FIRM, left):
                         self.robbed.add(owner)
-                    claims[got] = (discount(t), i)
+                    claims[got] = (discount(t, left), i)
+
+    def total(self) -> int:
+        """Return what all routes are worth together."""
+        claims: dict[Cell, tuple[int, int]] = {}
+        for i in range(len(self.found)):
+            self.claim(i, claims)
+        return sum(
+            discounted * (_UNIT if cell in self.known.targets else self.known.unseen_worth(cell))
+            for cell, (discounted, _) in claims.items()
+        )
 
 
 def route_features(known: TeamMap, robots: list[Cell]) -> np.ndarray:
@@ -160,7 +176,9 @@ def route_features(known: TeamMap, robots: list[Cell]) -> np.ndarray:
     :return: float32 (n_agents, 11)
     """
     out = np.zeros((len(robots), 11), np.float32)
-    for i, (top, *others) in enumerate(TeamRoutes(known, robots).found):
+    n_orders = min(constants.ORDERS, len(robots))
+    plans = [TeamRoutes(known, robots, begin) for begin in range(n_orders)]
+    for i, (top, *others) in enumerate(max(plans, key=TeamRoutes.total).found):
         if top.value == 0:
             continue
         out[i, list(top.first)] = 1.0

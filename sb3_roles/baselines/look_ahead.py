@@ -20,11 +20,12 @@ from area_search.look_ahead_data import (
     Labels,
     Marks,
     Routes,
-    Rules,
+    Timetable,
     make_labels,
     make_marks,
     make_routes,
-    make_rules,
+    make_timetable,
+    rules_at,
 )
 from area_search.look_ahead_search import forget
 from sb3_roles.baselines.greedy import Walker, first_move, random_bits
@@ -40,7 +41,7 @@ class LookAheadController(Walker):
     def _allocate(self, n_teams: int, n: int, area: int) -> tuple[Any, ...]:
         assert self.batch is not None
         return (
-            make_rules(self.batch.scene, self.batch.cells.shape[2]),
+            make_timetable(self.batch.scene, self.batch.cells.shape[2]),
             make_marks(area),
             make_labels(area),
             make_routes(n, area),
@@ -60,7 +61,7 @@ def _walk_routes(
     cells: np.ndarray,
     border: int,
     position: np.ndarray,
-    rules: Rules,
+    timetable: Timetable,
     marks: Marks,
     labels: Labels,
     routes: Routes,
@@ -76,6 +77,7 @@ def _walk_routes(
     for m in range(position.shape[0]):
         flat = cells[m].reshape(-1)
         place(cells.shape[2], border, position[m], starts)
+        rules = rules_at(timetable, timetable.rules.left - steps[m])
         plan_routes(flat, starts, TARGET_WORTH, True, rules, marks, labels, routes)
         forget(marks)
         for i in range(n_agents):
