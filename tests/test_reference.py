@@ -80,7 +80,8 @@ def random_scene(rng: np.random.Generator, largest: int) -> Scene:
         horizon=int(rng.integers(1, 40)),
         early_stop_patience=[None, 10, 3][rng.integers(3)],
         explore_normalizer=float(rng.choice([3.0, 5.0, 16.52])),
-        reward_sharing=str(rng.choice(["own", "same_role"])),
+        reward_sharing=(sharing := str(rng.choice(["own", "same_role"]))),
+        team_share=float(rng.choice([0.0, 0.3, 1.0])) if sharing == "own" else 0.0,
         alpha=float(rng.choice([0.4, 0.1, 0.0])),
         beta=float(rng.choice([0.6, 0.9, 1.0])),
     )

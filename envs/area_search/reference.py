@@ -209,10 +209,11 @@ class ReferenceAreaSearch:
             team = [i]
             if self.scene.reward_sharing == "same_role":
                 team = [j for j, role in enumerate(self.roles) if role == self.roles[i]]
-            cells = sum(self.new_cells[j] for j in team)
-            rows.append(
-                [cells / self.scene.explore_normalizer, sum(self.new_targets[j] for j in team)]
-            )
+            counts = []
+            for new in (self.new_cells, self.new_targets):
+                mean, s = sum(new) / len(new), self.scene.team_share
+                counts.append((1 - s) * sum(new[j] for j in team) + s * mean)
+            rows.append([counts[0] / self.scene.explore_normalizer, counts[1]])
         return np.array(rows, np.float32)
 
     def rewards(self) -> np.ndarray:

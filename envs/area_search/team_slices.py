@@ -84,6 +84,7 @@ class TeamSlice:
             scene.n_targets,
             float(scene.explore_normalizer),
             scene.reward_sharing == "same_role",
+            float(scene.team_share),
             float(scene.alpha),
             float(scene.beta),
             *own("roles"),
