@@ -16,13 +16,14 @@ from toy_envs import PlainEnv, ToyEnv, WitnessEnv
 
 from area_search import AreaSearchEnv
 from sb3_roles import HMAPPO, MAPPO, RoleWrapper, TeamWrapper, make_team_vec_env
+from sb3_roles.baselines.area import area_scene
 from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback, TeamProgressBar
 from sb3_roles.common.checkpoint import read_checkpoint
 from sb3_roles.common.row_policies import MaskedRowPolicy, MaskWrapper
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.evaluation.episodes import held_out_seed, selection_seed
-from sb3_roles.evaluation.evaluators import VecEnvEvaluator, area_scene, make_evaluator
+from sb3_roles.evaluation.evaluators import VecEnvEvaluator, make_evaluator
 
 SMALL = {
     "local_channels": [4] * 3,

@@ -137,7 +137,7 @@ def test_the_paper_names_every_value():
     assert set(settings["wrapper_kwargs"]) == set(constructor_parameters(RoleWrapper)) - {"venv"}
     scene = {field.name for field in fields(Scene)}
     # What the scenes differ in, so that --scene still means what it says; the wrapper's rewards.
-    others = {"name", "n_targets", "free_fraction", "alpha", "beta", "reward_sharing"}
+    others = {"name", "n_targets", "free_fraction", "alpha", "beta", "reward_sharing", "team_share"}
     assert set(settings["env_kwargs"]) == scene - others | {"scene", "sub_goal"}
     for name in SCENES:
         changed = get_scene(name, **{key: settings["env_kwargs"][key] for key in scene - others})

@@ -33,10 +33,15 @@ def make(kind="hmappo", n_teams=N_TEAMS, n_groups=1, backend="native", seed=3, *
     roles = {
         "mappo": None,
         "hmappo": {},
+        "mix": {},
         "random": {"role_control": "random", "role_every": 3},
         "lasting": {"role_every": 3, "reward_sharing": "same_role"},
     }[kind]
-    env = small_search(n_teams, backend, sub_goal="nearest", roles=roles, early_stop_patience=8)
+    # What scenes of a mix differ in, the target density, shows in routes.
+    task = {"sub_goal": "nearest"}
+    if kind == "mix":
+        task = {"sub_goal": "routes", "scene": ["obstacles_16", "hard", "obstacles_52"]}
+    env = small_search(n_teams, backend, roles=roles, early_stop_patience=8, **task)
     algorithm = MAPPO if kind == "mappo" else HMAPPO
     return algorithm(
         next(iter(algorithm.policy_aliases)),
@@ -125,6 +130,7 @@ def train(model, n_rollouts=3):
         ("hmappo", {"share_encoders": True}),
         ("random", {"encoder": "patches"}),
         ("lasting", {"encoder": "patches", "see_role": True}),
+        ("mix", {"encoder": "patches"}),
     ],
 )
 @pytest.mark.parametrize("n_groups", [1, 3])

@@ -35,10 +35,11 @@ def assert_same(batch: BatchedAreaSearch, references: list[ReferenceAreaSearch])
 def compare(scene: Scene, seed: int, sub_goal: str, n_teams: int, n_episodes: int) -> int:
     """Play random episodes on both; return the number of compared steps."""
     rng = np.random.default_rng(seed)
-    batch = BatchedAreaSearch(scene, n_teams, sub_goal)
+    time = bool(seed % 2)
+    batch = BatchedAreaSearch(scene, n_teams, sub_goal, time=time)
     batch.reset(seed)
     episodes = np.arange(n_teams)
-    references = [ReferenceAreaSearch(scene, seed, int(e), sub_goal) for e in episodes]
+    references = [ReferenceAreaSearch(scene, seed, int(e), sub_goal, time=time) for e in episodes]
     compared = ended = 0
     assert_same(batch, references)
     while ended < n_episodes * n_teams:
@@ -57,7 +58,8 @@ def compare(scene: Scene, seed: int, sub_goal: str, n_teams: int, n_episodes: in
             batch.reset_teams(done)
             episodes[done] += n_teams
             for m in np.flatnonzero(done):
-                references[m] = ReferenceAreaSearch(scene, seed, int(episodes[m]), sub_goal)
+                episode = int(episodes[m])
+                references[m] = ReferenceAreaSearch(scene, seed, episode, sub_goal, time=time)
     return compared
 
 
@@ -78,7 +80,8 @@ def random_scene(rng: np.random.Generator, largest: int) -> Scene:
         horizon=int(rng.integers(1, 40)),
         early_stop_patience=[None, 10, 3][rng.integers(3)],
         explore_normalizer=float(rng.choice([3.0, 5.0, 16.52])),
-        reward_sharing=str(rng.choice(["own", "same_role"])),
+        reward_sharing=(sharing := str(rng.choice(["own", "same_role"]))),
+        team_share=float(rng.choice([0.0, 0.3, 1.0])) if sharing == "own" else 0.0,
         alpha=float(rng.choice([0.4, 0.1, 0.0])),
         beta=float(rng.choice([0.6, 0.9, 1.0])),
     )

@@ -38,16 +38,20 @@ _STATE_ARRAYS = (
 )
 
 
-def observation_space(scene: Scene, sub_goal: str = "none", known_map: bool = False) -> spaces.Dict:
+def observation_space(
+    scene: Scene, sub_goal: str = "none", known_map: bool = False, time: bool = False
+) -> spaces.Dict:
     """Return one robot's observation space; no shape depends on the number of robots.
 
     :param scene: the task
     :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: with the key ``known``
+    :param time: with the key ``time``
     :return: flat Dict of ``local`` uint8 (4, side, side), ``joint`` uint8 (2, height, width),
         ``position`` float32 (2,), ``state`` uint8 (5, height, width); unless ``sub_goal`` is
         ``"none"``, ``sub_goal`` float32 (2, 6), (2, 11) or (3, 11); with ``known_map``, ``known``
-        uint8 (2, height, width)
+        uint8 (2, height, width); with ``time``, ``time`` float32 (1,), the share of the horizon
+        that is left
     :raises ValueError: if ``sub_goal`` is unknown
     """
     if sub_goal not in paths.SUB_GOALS:
@@ -67,6 +71,8 @@ def observation_space(scene: Scene, sub_goal: str = "none", known_map: bool = Fa
         boxes["sub_goal"] = spaces.Box(np.zeros_like(high), high, high.shape, np.float32)
     if known_map:
         boxes["known"] = spaces.Box(0, 1, (len(layout.KNOWN_CHANNELS), *size), np.uint8)
+    if time:
+        boxes["time"] = spaces.Box(0.0, 1.0, (1,), np.float32)
     return spaces.Dict(boxes)
 
 
@@ -78,6 +84,7 @@ class TeamArrays:
     :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the key ``known``, too
     :param n_threads: see :attr:`n_threads`
+    :param time: observe the key ``time``, too
     """
 
     team_observation_keys: tuple[str, ...] = ("joint", "state")
@@ -89,6 +96,7 @@ class TeamArrays:
         sub_goal: str,
         known_map: bool = False,
         n_threads: int = 1,
+        time: bool = False,
     ) -> None:
         self.scenes = scenes
         self._common = scenes[0]  # for what all scenes agree in
@@ -96,13 +104,15 @@ class TeamArrays:
         self.n_teams = n_teams
         self.n_agents = self._common.n_agents
         self.sub_goal = sub_goal
-        self.known_map = False
+        self.known_map = self.time = False
         self.observation_space = observation_space(self._common, sub_goal)
         self._started = False
         self._n_threads = n_threads
         self._allocate()
         if known_map:
             self.show_known_map()
+        if time:
+            self.show_time()
 
     def _allocate(self) -> None:
         scene, m, n = self._common, self.n_teams, self.n_agents
@@ -209,15 +219,32 @@ class TeamArrays:
         if self.known_map:
             return
         self.known_map = True
-        self.observation_space = observation_space(self._common, self.sub_goal, True)
-        self.team_observation_keys = (*self.team_observation_keys, "known")
         size = (self._common.height, self._common.width, len(layout.KNOWN_CHANNELS))
         self._known = np.zeros((self.n_teams, *size), np.uint8)
-        self.observations["known"] = np.moveaxis(self._known, -1, -3)
-        self.first_team["known"] = self.observations["known"][0]
+        self._show("known", np.moveaxis(self._known, -1, -3))
+
+    def show_time(self) -> None:
+        """Observe the key ``time`` from now on, if it is not observed yet.
+
+        It is the share of the horizon that is left: float32 (n_teams, 1), 1 after a reset and 0
+        after the last step. Nothing else changes.
+        """
+        if self.time:
+            return
+        self.time = True
+        self._time = np.zeros((self.n_teams, 1), np.float32)
+        self._show("time", self._time)
+
+    def _show(self, key: str, array: np.ndarray) -> None:
+        """Add an observation that a team shares, (n_teams, ...)."""
+        options = self.known_map, self.time
+        self.observation_space = observation_space(self._common, self.sub_goal, *options)
+        self.team_observation_keys = (*self.team_observation_keys, key)
+        self.observations[key] = array
+        self.first_team[key] = array[0]
         self._bind_kernels()
         if self._started:
-            kernels.observe_known(self._everyone, self.cells, self._border, self._known)
+            self._observe(self._everyone)
 
     def _observe(self, which: np.ndarray) -> None:
         self._threads.run(lambda part: part.observe(which))
@@ -293,6 +320,7 @@ class TeamArrays:
             "sub_goal": self.sub_goal,
             "known_map": self.known_map,
             "n_threads": self.n_threads,
+            "time": self.time,
         }
         return {"options": options, "arrays": self.get_state() if self._started else None}
 

@@ -35,6 +35,8 @@ class BatchedAreaSearch(TeamArrays):
         (``area_search.paths``) join the observation
     :param known_map: observe the team's map under the key ``known``, see :meth:`show_known_map`
     :param n_threads: threads that work on the teams of a step; it changes no result
+    :param time: observe the share of the horizon that is left under the key ``time``, see
+        :meth:`show_time`
     :param scene_options: fields of the scene, or of all scenes, to change
     :raises ValueError: if an option is unknown or out of range
     """
@@ -49,12 +51,13 @@ class BatchedAreaSearch(TeamArrays):
         sub_goal: str = "none",
         known_map: bool = False,
         n_threads: int = 1,
+        time: bool = False,
         **scene_options: Any,
     ) -> None:
         if isinstance(n_teams, bool) or not isinstance(n_teams, int) or n_teams < 1:
             raise ValueError(f"n_teams must be a whole number of at least 1, got {n_teams!r}")
         scenes = get_scenes(scene, **scene_options)
-        super().__init__(scenes, n_teams, sub_goal, known_map, check_threads(n_threads))
+        super().__init__(scenes, n_teams, sub_goal, known_map, check_threads(n_threads), time)
         self.possible_agents = [f"robot_{i}" for i in range(self.n_agents)]
         self.action_space = spaces.Discrete(N_ACTIONS)
         self._window: Window | None = None

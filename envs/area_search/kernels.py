@@ -224,6 +224,7 @@ def step_teams(
     n_targets: int,
     explore_normalizer: float,
     same_role: bool,
+    team_share: float,
     alpha: float,
     beta: float,
     roles: np.ndarray,
@@ -312,7 +313,13 @@ def step_teams(
         if totals[m, T90_TRUE] == NEVER and metrics[m, 1] >= 0.9:
             totals[m, T90_TRUE] = steps[m] - 1
         reward_components(
-            new_cells[m], new_targets[m], roles[m], explore_normalizer, same_role, components[m]
+            new_cells[m],
+            new_targets[m],
+            roles[m],
+            explore_normalizer,
+            same_role,
+            team_share,
+            components[m],
         )
         weighted_reward(components[m], alpha, beta, rewards[m])
 

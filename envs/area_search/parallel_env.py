@@ -31,7 +31,8 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
       known uncovered targets; ``position`` float32 (2,) row and column; ``state``
       (5, height, width) true obstacles, frontier, true uncovered targets, robots, explored, for
       critics only; ``sub_goal`` float32, see ``area_search.paths``; with ``known_map``, ``known``
-      (2, height, width) the team's known free cells and known obstacles.
+      (2, height, width) the team's known free cells and known obstacles; with ``time``, ``time``
+      float32 (1,), the share of the horizon that is left.
     * **Rewards**: ``alpha * R_e + beta * R_c`` (Eq. 2); the components are in
       ``infos[robot]["reward_components"]``.
     * **Infos**: ``reward_components``; ``metrics`` of the step: ``explo_paper``, ``explo_true``,
@@ -44,6 +45,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         several teams alone, see :meth:`batched`
     :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the team's map, too
+    :param time: observe the share of the horizon that is left, too
     :param render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a pygame window)
     :param scene_options: fields of the scene to change, such as ``n_agents=8``
     :raises ValueError: if an option is unknown or out of range
@@ -65,6 +67,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
         sub_goal: str = "none",
         render_mode: str | None = None,
         known_map: bool = False,
+        time: bool = False,
         **scene_options: Any,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -72,7 +75,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
             raise ValueError(unknown("render_mode", render_mode, allowed))
         self.sub_goal = sub_goal
         self.render_mode = render_mode
-        self._batch = BatchedAreaSearch(scene, 1, sub_goal, known_map, **scene_options)
+        self._batch = BatchedAreaSearch(scene, 1, sub_goal, known_map, time=time, **scene_options)
         self.scenes = self._batch.scenes
         self.team_observation_keys = self._batch.team_observation_keys
         self.possible_agents = list(self._batch.possible_agents)
@@ -113,7 +116,8 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
 
         :param n_teams: number of teams
         """
-        return BatchedAreaSearch(self.scenes, n_teams, self.sub_goal, self._batch.known_map)
+        shown = {"known_map": self._batch.known_map, "time": self._batch.time}
+        return BatchedAreaSearch(self.scenes, n_teams, self.sub_goal, **shown)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

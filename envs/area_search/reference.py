@@ -68,6 +68,7 @@ class ReferenceAreaSearch:
     :param episode: number of the episode in the stream
     :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
     :param known_map: observe the team's map, too
+    :param time: observe the share of the horizon that is left, too
     """
 
     def __init__(
@@ -77,8 +78,10 @@ class ReferenceAreaSearch:
         episode: int = 0,
         sub_goal: str = "none",
         known_map: bool = False,
+        time: bool = False,
     ) -> None:
-        self.scene, self.sub_goal, self.known_map = scene, sub_goal, known_map
+        self.scene, self.sub_goal = scene, sub_goal
+        self.known_map, self.time = known_map, time
         stream = ReferenceStream(seed, episode)
         self.all_cells = [(r, c) for r in range(scene.height) for c in range(scene.width)]
         seed_cell = (int(stream.unit() * scene.height), int(stream.unit() * scene.width))
@@ -206,10 +209,11 @@ class ReferenceAreaSearch:
             team = [i]
             if self.scene.reward_sharing == "same_role":
                 team = [j for j, role in enumerate(self.roles) if role == self.roles[i]]
-            cells = sum(self.new_cells[j] for j in team)
-            rows.append(
-                [cells / self.scene.explore_normalizer, sum(self.new_targets[j] for j in team)]
-            )
+            counts = []
+            for new in (self.new_cells, self.new_targets):
+                mean, s = sum(new) / len(new), self.scene.team_share
+                counts.append((1 - s) * sum(new[j] for j in team) + s * mean)
+            rows.append([counts[0] / self.scene.explore_normalizer, counts[1]])
         return np.array(rows, np.float32)
 
     def rewards(self) -> np.ndarray:
@@ -245,6 +249,9 @@ class ReferenceAreaSearch:
             if self.known_map:
                 seen = (self.explored & self.free, self.explored - self.free)
                 observation["known"] = np.array([self._map(cells) for cells in seen], np.uint8)
+            if self.time:
+                left = (self.scene.horizon - self.n_steps) / self.scene.horizon
+                observation["time"] = np.array([left], np.float32)
             observations.append(observation)
         return observations
 

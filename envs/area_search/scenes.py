@@ -16,6 +16,8 @@ MAX_SENSOR_RADIUS = 32
 MAX_VIEW_RADIUS = 32
 MAX_HORIZON = 1_000_000
 REWARD_SHARING = ("own", "same_role")
+# Fields that scenes did not always have, and what they were like before.
+LATER = {"team_share": 0.0}
 # What the teams of one batch have in common: the shapes of arrays, and who hears whom.
 _SHARED = (
     "height",
@@ -57,6 +59,8 @@ class Scene:
         lens formula is misprinted, the released code uses 3, and 5 normalizes R_e into [0, 1]
     :param reward_sharing: ``"own"`` rewards a robot for its own cells and targets, ``"same_role"``
         for those of all robots that act in its role (Eq. 6); without roles that is the whole team
+    :param team_share: s, with ``reward_sharing="own"``: a robot's reward, and each component of
+        it, is (1 - s) of its own and s of the mean over the team
     :param alpha: weight of the exploration reward R_e in the scalar reward (Eq. 2)
     :param beta: weight of the coverage reward R_c in the scalar reward (Eq. 2)
     :raises SceneError: if a field is out of its range, or the targets do not fit
@@ -79,6 +83,7 @@ class Scene:
     reward_sharing: str = "own"
     alpha: float = 0.4
     beta: float = 0.6
+    team_share: float = 0.0
 
     def __post_init__(self) -> None:
         # It becomes part of file names.
@@ -104,6 +109,7 @@ class Scene:
             ("communication_radius", 0.0, 1e6),
             ("alpha", 0.0, 1e6),
             ("beta", 0.0, 1e6),
+            ("team_share", 0.0, 1.0),
         ):
             self._check_number(field, bottom, top)
         self._check_number("free_fraction", 0.0, 1.0, open_low=True)
@@ -116,6 +122,11 @@ class Scene:
             )
         if not isinstance(self.reward_sharing, str) or self.reward_sharing not in REWARD_SHARING:
             raise SceneError(unknown("reward_sharing", self.reward_sharing, REWARD_SHARING))
+        if self.team_share > 0.0 and self.reward_sharing != "own":
+            raise SceneError(
+                f"scene field team_share must be 0 with reward_sharing {self.reward_sharing!r}, "
+                f"which shares already, got {self.team_share:g}"
+            )
 
     def _check_integer(self, field: str, low: int, high: int, or_else: str = "") -> None:
         value = getattr(self, field)
@@ -154,6 +165,18 @@ class Scene:
     def n_obstacles(self) -> int:
         """Obstacle cells."""
         return self.n_cells - self.n_free
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fields by name, as records and recordings hold them.
+
+        What scenes did not always have is left out where it is as it was, so that a scene has the
+        same facts, and their hash, as before; ``Scene(**facts)`` is the scene.
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        for name, before in LATER.items():
+            if values[name] == before:
+                del values[name]
+        return values
 
     def with_options(self, **options: Any) -> Scene:
         """Return a copy with some fields changed.

@@ -84,6 +84,7 @@ class TeamSlice:
             scene.n_targets,
             float(scene.explore_normalizer),
             scene.reward_sharing == "same_role",
+            float(scene.team_share),
             float(scene.alpha),
             float(scene.beta),
             *own("roles"),
@@ -114,6 +115,8 @@ class TeamSlice:
         self._known_arguments: tuple[Any, ...] = (
             (cells, border, *own("_known")) if arrays.known_map else ()
         )
+        self._horizon = scene.horizon
+        self._clock = own("_time", "steps") if arrays.time else ()
         self._sub_goal_kernel = {
             "none": None,
             "nearest": paths.nearest_sub_goals,
@@ -171,6 +174,10 @@ class TeamSlice:
         kernels.observe_teams(mine, *self._observe_arguments)
         if self._known_arguments:
             kernels.observe_known(mine, *self._known_arguments)
+        if self._clock:
+            # Of all teams: it changes with their steps alone.
+            time, steps = self._clock
+            time[:, 0] = (self._horizon - steps) / self._horizon
         if self._sub_goal_kernel is not None:
             self._sub_goal_kernel(mine, *self._sub_goal_arguments)
         if self._route_arguments:

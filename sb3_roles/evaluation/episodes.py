@@ -7,7 +7,6 @@ import json
 import platform
 import sys
 import time
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -94,7 +93,7 @@ def describe(controller: Controller, scene: Scene, name: str | None = None) -> d
     config = {
         "controller": type(controller).__name__,
         "controller_options": getattr(controller, "description", {}),
-        "scene": asdict(scene),
+        "scene": scene.facts(),
         "deterministic": getattr(controller, "deterministic", None),
         "communication": getattr(controller, "communicate", None),
         "version": __version__,

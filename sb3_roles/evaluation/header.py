@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from typing import Any
 
-from area_search.scenes import Scene, shown
+from area_search.scenes import LATER, Scene, shown
 
 _Check = Callable[[Any], bool]
 
@@ -60,7 +60,9 @@ def checked_scene(metadata: dict[str, Any], timing: dict[str, Any]) -> Scene:
                 raise ValueError(f"the entry {key!r} of the metadata is missing")
             if not is_sound(entries[key]):
                 raise ValueError(f"the entry {key!r} of the metadata is {shown(entries[key])}")
-    unknown = set(metadata["scene"]) ^ {field.name for field in fields(Scene)}
+    given = metadata["scene"]
+    names = {field.name for field in fields(Scene)}
+    unknown = (set(given) - names) | (names - set(LATER) - set(given))
     if unknown:
         raise ValueError(f"the scene of the metadata has not the fields of one: {min(unknown)!r}")
-    return Scene(**metadata["scene"])
+    return Scene(**given)

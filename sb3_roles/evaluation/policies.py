@@ -167,6 +167,8 @@ class PolicyController:
             self._set_rule(batch.goal_nearness)
         if "known" in self.keys:
             batch.show_known_map()
+        if "time" in self.keys:
+            batch.show_time()
         for key in self.keys:
             if key not in batch.observations:
                 raise ValueError(

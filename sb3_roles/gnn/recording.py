@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +64,7 @@ def record(
     player: Any = controller_class(controller)() if isinstance(controller, str) else controller
     if name is None:
         name = controller if isinstance(controller, str) else type(controller).__name__
-    facts = {"controller": name, "seed": int(seed), "scene": asdict(scene)}
+    facts = {"controller": name, "seed": int(seed), "scene": scene.facts()}
     done: list[Demonstrations] = []
     if path is not None and path.exists():
         done = [_taken_up(path, facts)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +110,7 @@ def summary(facts: dict[str, Any], scene: Scene | None) -> str:
         + f"; sha256 {facts['sha256'][:16]}"
     )
     # A recording has no early stop, whatever the run has.
-    own = {} if scene is None else asdict(scene.with_options(early_stop_patience=None))
+    own = {} if scene is None else scene.with_options(early_stop_patience=None).facts()
     differences = [
         f"{key} {shown.get(key)!r}, here {value!r}"
         for key, value in own.items()

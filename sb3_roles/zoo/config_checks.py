@@ -138,10 +138,11 @@ def _together(config: Mapping[str, Any]) -> list[str]:
     if config["env"] != AREA_SEARCH:
         return found
     env_kwargs, policy_kwargs = config["env_kwargs"], config["policy_kwargs"]
-    found += _mix_problems(config, len(scenes_of_run(config)))
+    scenes = scenes_of_run(config)
+    found += _mix_problems(config, len(scenes))
     if links_robots(config) and RADIUS in policy_kwargs:
         # Scenes of a mix agree in it.
-        given, radius = policy_kwargs[RADIUS], scenes_of_run(config)[0].communication_radius
+        given, radius = policy_kwargs[RADIUS], scenes[0].communication_radius
         if given != radius:
             found.append(
                 f"policy_kwargs.{RADIUS} must be the environment's, {radius:g}, got {given}: "
@@ -153,6 +154,12 @@ def _together(config: Mapping[str, Any]) -> list[str]:
             found.append(
                 f"env_kwargs.reward_sharing must be own for {config['algo']}, got "
                 f"{env_kwargs['reward_sharing']}: with roles, wrapper_kwargs.reward_sharing shares"
+            )
+        sharing = config["wrapper_kwargs"].get("reward_sharing", "own")
+        if scenes[0].team_share > 0.0 and sharing != "own":
+            found.append(
+                f"env_kwargs.team_share must be 0 with wrapper_kwargs.reward_sharing {sharing}, "
+                f"which shares already, got {scenes[0].team_share:g}"
             )
         found += [
             f"env_kwargs.{key} weighs nothing for {config['algo']}: with roles, "

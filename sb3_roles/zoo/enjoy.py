@@ -186,7 +186,7 @@ def _load(args: Namespace) -> tuple[LoadedRun, bool]:
 
 def _changed(config: Mapping[str, Any], args: Namespace) -> dict[str, Any]:
     """Return the configuration of the run with the changes of the command line."""
-    from sb3_roles.zoo.environments import env_problems
+    from sb3_roles.zoo.environments import env_problems, scenes_of_run
 
     options = dict(config.get("env_kwargs") or {})
     if config["env"] == AREA_SEARCH:
@@ -199,7 +199,12 @@ def _changed(config: Mapping[str, Any], args: Namespace) -> dict[str, Any]:
     found = env_problems(config["env"], options)
     if found:
         raise UsageError("; ".join(found))
-    return {**config, "env_kwargs": options}
+    changed = {**config, "env_kwargs": options}
+    scenes = scenes_of_run(changed) if config["env"] == AREA_SEARCH else ()
+    if len(scenes) > 1:
+        names = ", ".join(scene.name for scene in scenes)
+        raise UsageError(f"it was trained on a mix of scenes ({names}): add --scene NAME")
+    return changed
 
 
 def _episodes(
@@ -213,14 +218,11 @@ def _episodes(
         if config["env"] == AREA_SEARCH:
             from sb3_roles.evaluation.episodes import held_out_seed
 
-            scenes, links = scenes_of_run(config), bool(controller.communicate)
-            if len(scenes) > 1:
-                names = ", ".join(scene.name for scene in scenes)
-                raise UsageError(f"the run was trained on a mix ({names}): add --scene NAME")
+            scene, links = scenes_of_run(config)[0], bool(controller.communicate)
             # The episodes that `evaluate --seed` scores.
             seed = held_out_seed(args.seed)
             for episode in range(args.episodes):
-                yield play_scene(controller, scenes[0], seed, episode, show, links)
+                yield play_scene(controller, scene, seed, episode, show, links)
             return
         drawn = {} if show is None else {"render_mode": "rgb_array"}
         env = env_factory(config["env"], {**config["env_kwargs"], **drawn})()

@@ -21,6 +21,8 @@ ENVIRONMENTS: dict[str, str] = {AREA_SEARCH: "area_search:AreaSearchEnv"}
 SUB_GOALS = ("none", "nearest", "assigned", "routes")
 GOAL_SETS = ("frontier", "target")
 REWARD_COMPONENTS = ("explore", "cover")
+# Observations that are there on demand; arguments that are true or false.
+SHOWN = ("known_map", "time")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
@@ -38,10 +40,10 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
         return [closest("environment", env, ENVIRONMENTS) + ", or module:factory"]
     options = dict(env_kwargs)
     name, sub_goal = options.pop("scene", "hard"), options.pop("sub_goal", "none")
-    known_map = options.pop("known_map", False)
     found = []
-    if not isinstance(known_map, bool):
-        found.append(f"env_kwargs: known_map must be true or false, got {known_map!r}")
+    for key in SHOWN:
+        if not isinstance(value := options.pop(key, False), bool):
+            found.append(f"env_kwargs: {key} must be true or false, got {value!r}")
     if sub_goal not in SUB_GOALS:
         found.append(f"env_kwargs: {closest('sub_goal', sub_goal, SUB_GOALS)}")
     names_of_scenes = name if isinstance(name, list) else [name]
@@ -51,7 +53,7 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
     known = [field.name for field in fields(Scene) if field.name != "name"]
     for key in options:
         if key not in known:
-            names = ["scene", "sub_goal", "known_map", *known]
+            names = ["scene", "sub_goal", *SHOWN, *known]
             found.append(closest("key in env_kwargs", key, names))
     single = []
     for key, value in options.items():
@@ -96,8 +98,8 @@ def scenes_of_run(config: Mapping[str, Any]) -> tuple[Scene, ...]:
     :param config: a checked configuration
     """
     options = dict(config["env_kwargs"])
-    options.pop("sub_goal", None)
-    options.pop("known_map", None)
+    for key in ("sub_goal", *SHOWN):
+        options.pop(key, None)
     return get_scenes(options.pop("scene", "hard"), **options)
 
 
