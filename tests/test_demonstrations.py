@@ -35,14 +35,15 @@ def same(first, second):
     )
 
 
-def test_a_recording_is_what_the_teams_observe_and_do():
-    found = record("greedy_assigned", SCENE, 3, seed=5)
+@pytest.mark.parametrize("name", ["greedy_assigned", "look_ahead"])
+def test_a_recording_is_what_the_teams_observe_and_do(name):
+    found = record(name, SCENE, 3, seed=5)
     assert len(found) == 3
     assert found.n_steps == 12
     assert found.n_agents == 3
     batch = BatchedAreaSearch(SCENE, 3, known_map=True)
     batch.reset([recording._STREAM + 5] * 3, np.arange(3))
-    controller = controller_class("greedy_assigned")()
+    controller = controller_class(name)()
     controller.begin(batch)
     for t in range(12):
         seen = found.observe(np.arange(3), np.full(3, t))
@@ -282,9 +283,10 @@ def command(*arguments):
     return args.run(args)
 
 
-def test_the_command_records_and_goes_on(tmp_path, capsys):
+@pytest.mark.parametrize("name", ["random", "look_ahead"])
+def test_the_command_records_and_goes_on(tmp_path, capsys, name):
     path = tmp_path / "d.npz"
-    options = ["--controller", "random", "--n-agents", "2", "--seed", "4", "--out", str(path)]
+    options = ["--controller", name, "--n-agents", "2", "--seed", "4", "--out", str(path)]
     options += ["--scene-options", "horizon:5", "--batch-size", "2"]
     assert command(*options, "--episodes", "2") == 0
     assert command(*options, "--episodes", "5") == 0
@@ -294,7 +296,7 @@ def test_the_command_records_and_goes_on(tmp_path, capsys):
         "5 of 5 episodes",
     ]
     scene = get_scene("hard", n_agents=2, horizon=5)
-    assert same(load_demonstrations(path), record("random", scene, 5, seed=4))
+    assert same(load_demonstrations(path), record(name, scene, 5, seed=4))
     with pytest.raises(UsageError) as caught:
         command(*options, "--episodes", "2", "--seed", "5")
     assert "argument --out" in one_line(caught.value)

@@ -23,6 +23,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "hard": {},
     "hard, nearest": {"sub_goal": "nearest"},
     "easy, assigned, 8 robots": {"scene": "easy", "sub_goal": "assigned", "n_agents": 8},
+    "routes": {"sub_goal": "routes"},
     "early stop": {"early_stop_patience": 5, "reward_sharing": "same_role"},
     "one robot, one step": {"n_agents": 1, "horizon": 1},
     "small and wide": {"height": 5, "width": 40, "n_targets": 20, "view_radius": 6},
@@ -88,7 +89,7 @@ def test_pettingzoo_seeds(variant: str) -> None:
     parallel_seed_test(lambda: AreaSearchEnv(**VARIANTS[variant]), num_cycles=120)
 
 
-@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned"])
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes"])
 def test_gymnasium_and_sb3_accept_a_robot_on_its_own(sub_goal: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -192,7 +192,7 @@ def test_an_unknown_option_gives_the_closest_match(make: type, option: str, hint
 def test_an_unknown_sub_goal_gives_the_closest_match(make: type) -> None:
     with pytest.raises(ValueError, match="did you mean 'nearest'") as raised:
         make("hard", sub_goal="neares")
-    assert "none, nearest, assigned" in one_line(raised.value)
+    assert "none, nearest, assigned, routes" in one_line(raised.value)
 
 
 @pytest.mark.parametrize("n_teams", [0, -1, 1.0, "2", True, None])

@@ -1,7 +1,7 @@
 """What the joint look-ahead works with: its constants, and named tuples of arrays for its kernels.
 
-Kernels get the constants in :class:`Rules`, never as globals: a cached kernel keeps the value that
-a global of another file had when it was compiled.
+Kernels get what can be tuned in :class:`Rules`, never as globals: a cached kernel keeps the value
+that a global of another file had when it was compiled.
 """
 
 from __future__ import annotations

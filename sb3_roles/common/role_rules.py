@@ -16,8 +16,9 @@ class NearestRole:
     """The role whose goal is nearest: for area search, cover when a known target is nearer.
 
     What is compared is what the robot observes. In area search with ``sub_goal="nearest"`` that is
-    the nearest goal of each kind; with ``"assigned"`` it is the goal of each kind that was assigned
-    to this robot, however near others are, and a kind of which it was assigned none has nearness 0.
+    the nearest goal of each kind; with ``"assigned"`` and ``"routes"`` it is the goal of each kind
+    that was assigned to this robot, however near others are, and a kind of which it was assigned
+    none has nearness 0.
 
     Of equally near goals, the one whose goal set the environment names first is taken; so it is
     when no goal is known.
@@ -32,7 +33,7 @@ class NearestRole:
         if not goal_nearness:
             raise ValueError(
                 "role_control='nearest' needs an environment that declares goal_nearness, which "
-                "this one does not (area search does with sub_goal='nearest' or 'assigned')"
+                "this one does not (area search does with any sub_goal but 'none')"
             )
         of_goal_set: dict[str, int] = {}
         for index, role in enumerate(roles):

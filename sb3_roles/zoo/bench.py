@@ -34,6 +34,7 @@ _CASES = {
     "native none": "batch of 128 teams",
     "native nearest": "the same, nearest sub-goals",
     "native assigned": "the same, assigned sub-goals",
+    "native routes": "16 teams, assigned sub-goals and look-ahead routes",
     "native_vec_env none": "vectorized environment, native",
     "supersuit_vec_env none": "vectorized environment, SuperSuit",
     "pettingzoo none": "PettingZoo environment",

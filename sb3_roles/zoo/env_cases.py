@@ -13,7 +13,8 @@ from sb3_roles.zoo.environments import SUB_GOALS
 if TYPE_CHECKING:
     import numpy as np
 
-N_TEAMS, N_TEAMS_SUPERSUIT = 128, 8
+# Fewer with routes, of which the horizon before the measurement would take minutes.
+N_TEAMS, N_TEAMS_ROUTES, N_TEAMS_SUPERSUIT = 128, 16, 8
 ROBOTS, SIDES = (1, 4, 15, 50), (25, 50, 100, 200)
 TARGET_DENSITY = 0.16
 
@@ -103,23 +104,24 @@ def _native(scene: Scene, sub_goal: str) -> Case:
 
     from area_search import BatchedAreaSearch
 
-    batch = BatchedAreaSearch(scene, N_TEAMS, sub_goal)
+    n_teams = N_TEAMS_ROUTES if sub_goal == "routes" else N_TEAMS
+    batch = BatchedAreaSearch(scene, n_teams, sub_goal)
     batch.reset(0)
-    actions = _actions((N_TEAMS, scene.n_agents))
+    actions = _actions((n_teams, scene.n_agents))
     # One horizon in which every team is reset once, each share of them at another step: from then
     # on the resets, which cost many times a step, are spread evenly.
     for step in range(scene.horizon):
         batch.step(next(actions))
-        batch.reset_teams(np.arange(N_TEAMS) % scene.horizon == step)
+        batch.reset_teams(np.arange(n_teams) * scene.horizon // n_teams == step)
 
     def work() -> int:
         batch.step(next(actions))
         ended = batch.terminated | batch.truncated
         if ended.any():
             batch.reset_teams(ended)
-        return N_TEAMS
+        return n_teams
 
-    return Case("native", scene, sub_goal, N_TEAMS, work)
+    return Case("native", scene, sub_goal, n_teams, work)
 
 
 def _vec_env(scene: Scene, backend: str, n_teams: int) -> Case:
