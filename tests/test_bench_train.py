@@ -38,8 +38,8 @@ def test_every_case_does_the_same_counted_work(capsys):
         rate = case["joint_steps_per_second"]
         assert 0.0 < rate["min"] <= rate["median"] <= rate["max"]
     # Bits of the team's maps (2 and 5 channels of 625 cells) once per team, of the local ones (4 of
-    # 81) per robot, and 29 numbers of each robot.
-    bits, numbers = 7 * 625 + 4 * 4 * 81, 4 * 29 * 4
+    # 81) per robot, and 40 numbers of each robot.
+    bits, numbers = 7 * 625 + 4 * 4 * 81, 4 * 40 * 4
     assert bits / 8 <= hmappo["observation_bytes_per_joint_step"] - numbers < bits / 8 + 64
     assert hmappo["joint_steps_per_second"]["target"] == 2500
     assert hmappo["aim"]["target"] == 4000
@@ -55,11 +55,11 @@ def test_memory_is_compared_with_a_stock_buffer(capsys):
     memory = case["memory"]
     per_step = case["observation_bytes_per_joint_step"]
     assert memory["observation_bytes"] == 2 * n_steps * per_step
-    # All maps and 29 numbers, for each of 8 robots at each step.
+    # All maps and 40 numbers, for each of 8 robots at each step.
     cells_of_maps, rows = 7 * 625 + 4 * 81, 8 * n_steps
     float32, installed = (memory[f"dict_rollout_buffer_{x}"] for x in ("float32", "installed"))
-    assert float32["bytes"] == rows * 4 * (cells_of_maps + 29)
-    assert installed["bytes"] == rows * (cells_of_maps + 4 * 29)
+    assert float32["bytes"] == rows * 4 * (cells_of_maps + 40)
+    assert installed["bytes"] == rows * (cells_of_maps + 4 * 40)
     for rival in (float32, installed):
         assert rival["ratio"] == pytest.approx(rival["bytes"] / memory["observation_bytes"])
         assert rival["met"] is (rival["ratio"] >= 10)
