@@ -27,7 +27,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "envs"), 
 
 def sb3_roles(*args: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*COMMAND, *args], env=ENVIRONMENT, capture_output=True, text=True, timeout=120
+        [*COMMAND, *args], env=ENVIRONMENT, capture_output=True, text=True, timeout=300
     )
 
 

@@ -25,7 +25,10 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "<", "X", ">", "p", "*")
 # In points, of those that are small for their size.
 _SIZES = {"P": 5.5, "X": 5.5, "p": 5.0, "*": 7.0}
 # No dots: as vectors, they take a hundred times as much room as lines.
-_HATCHES = ("\\\\", "////", "\\\\\\\\", "xxxx", "----", "||||", "++++", "//", "")
+_HATCHES = (
+    *("\\\\", "////", "\\\\\\\\", "xxxx", "----", "||||", "++++", "//", ""),
+    *("xx", "++", "--", "||"),
+)
 
 AXES = {
     "explore_reward": "sum of R_e per episode (cells / B_e)",
