@@ -26,37 +26,16 @@ from sb3_roles.common.checkpoint import (
 from sb3_roles.common.env_state import env_gap
 from sb3_roles.common.snapshot import differences, load_weights, machine_facts
 from sb3_roles.evaluation.callback import EvaluationCallback
+from sb3_roles.prove.small_runs import SMALL_POLICIES, small_run
 from sb3_roles.zoo.algorithms import ALGORITHMS
-from sb3_roles.zoo.config import resolve, write_yaml
+from sb3_roles.zoo.config import write_yaml
 from sb3_roles.zoo.job import make_evaluate
 from sb3_roles.zoo.models import complete, load_model, make_env, make_model
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.training import CsvLog, StopSignals, train
 
-SMALL_ENV = {"height": 9, "width": 9, "n_targets": 8, "n_agents": 3, "horizon": 11}
 # 4 teams x 8 steps = 32 joint steps an iteration.
 N, CUT = 96, 32
-MAPS = {
-    "local_channels": [2, 2, 2],
-    "joint_channels": [2, 2, 2, 2],
-    "state_channels": [2, 2, 2],
-    "graph_width": 8,
-}
-TINY = {
-    "TeamPolicy": {**MAPS, "actor_arch": [8], "head_arch": [8], "value_arch": [8]},
-    "RolePolicy": {
-        **MAPS,
-        "role_arch": [8],
-        "role_head_arch": [8],
-        "primitive_arch": [8],
-        "value_arch": [8],
-    },
-    "RowPolicy": {"net_arch": [8]},
-    "RecurrentRowPolicy": {"net_arch": [8], "lstm_hidden_size": 8},
-}
-
-
-SMALL_UPDATES = {"batch_size": 8, "n_epochs": 2, "cg_max_steps": 3, "n_critic_updates": 2}
 
 
 @pytest.fixture(autouse=True)
@@ -65,21 +44,6 @@ def few_threads():
     th.set_num_threads(1)
     yield
     th.set_num_threads(before)
-
-
-def small_config(algo, backend="native", env="area-search-v0", **changes):
-    algorithm = ALGORITHMS[algo]
-    settings = {
-        "n_timesteps": N,
-        "n_envs": 4,
-        "env_kwargs": {**SMALL_ENV, "sub_goal": "nearest"} if env == "area-search-v0" else {},
-        "policy_kwargs": TINY[next(iter(algorithm.policies))],
-        "learning_rate": "lin_1.0e-3",
-        "n_steps": 8,
-        **{key: value for key, value in SMALL_UPDATES.items() if key in algorithm.parameters},
-        **changes,
-    }
-    return resolve(algo, env, settings, seed=3, vec_env=backend)
 
 
 def run(folder, config, resume=None, stop_at=None, evaluate=True):
@@ -155,13 +119,13 @@ EXACT = [
         {
             "wrapper_kwargs": {"role_every": 3, "role_control": "random"},
             "kl_coef": 0.5,
-            "policy_kwargs": {**TINY["RolePolicy"], "norm_layer": "frozen_batch"},
+            "policy_kwargs": {**SMALL_POLICIES["RolePolicy"], "norm_layer": "frozen_batch"},
         },
     ),
     (
         "hmappo",
         "native",
-        {"policy_kwargs": {**TINY["RolePolicy"], "optimizer_kwargs": {"fused": True}}},
+        {"policy_kwargs": {**SMALL_POLICIES["RolePolicy"], "optimizer_kwargs": {"fused": True}}},
     ),
     ("mappo", "native", {}),
     ("mappo", "supersuit", {}),
@@ -176,7 +140,7 @@ EXACT = [
 
 @pytest.mark.parametrize(("algo", "backend", "changes"), EXACT)
 def test_resumed_training_equals_straight_training(tmp_path, algo, backend, changes):
-    config = small_config(algo, backend, **changes)
+    config = small_run(algo, backend, **changes)
     (tmp_path / "straight").mkdir()
     (tmp_path / "cut").mkdir()
     _, straight = run(tmp_path / "straight", config)
@@ -196,14 +160,14 @@ def test_resumed_training_equals_straight_training(tmp_path, algo, backend, chan
 
 
 def test_two_runs_differ_only_by_seed(tmp_path):
-    _, first = run(tmp_path, small_config("mappo"), stop_at=32)
+    _, first = run(tmp_path, small_run("mappo"), stop_at=32)
     (tmp_path / "other").mkdir()
-    _, other = run(tmp_path / "other", {**small_config("mappo"), "seed": 4}, stop_at=32)
+    _, other = run(tmp_path / "other", {**small_run("mappo"), "seed": 4}, stop_at=32)
     assert any(not th.equal(first.policy[k], other.policy[k]) for k in first.policy)
 
 
 def test_environment_without_state_resumes_inexactly(tmp_path):
-    config = small_config("mappo", "supersuit", env="toy_envs:PlainEnv", policy_kwargs={})
+    config = small_run("mappo", "supersuit", env="toy_envs:PlainEnv", policy_kwargs={})
     env = make_env(config)
     assert "offers no get_state" in env_gap(env)
     assert PlainEnv().possible_agents == env.unwrapped.agents
@@ -221,7 +185,7 @@ def first_observations(folder, config, **options):
 
 
 def test_without_its_state_an_environment_does_not_repeat_its_first_episodes(tmp_path):
-    config = small_config("mappo", "supersuit", env="toy_envs:WitnessEnv", policy_kwargs={})
+    config = small_run("mappo", "supersuit", env="toy_envs:WitnessEnv", policy_kwargs={})
     start = first_observations(tmp_path / "a", config, stop_at=CUT)
     for other in ("b", "c"):
         shutil.copytree(tmp_path / "a", tmp_path / other)
@@ -240,7 +204,7 @@ def test_without_its_state_an_environment_does_not_repeat_its_first_episodes(tmp
 def test_records_of_an_episode_that_was_cut_off_are_dropped(tmp_path, algo):
     # Episodes of 5 steps, a checkpoint after 8: each team is in the middle of one.
     changes = {} if algo == "recurrent_ppo" else {"policy_kwargs": {}}
-    config = small_config(algo, "supersuit", env="toy_envs:PlainEnv", **changes)
+    config = small_run(algo, "supersuit", env="toy_envs:PlainEnv", **changes)
     _, cut = run(tmp_path, config, stop_at=CUT, evaluate=False)
     metrics = dict(cut.state["stateful"])["TeamMetricsCallback"]
     assert metrics["steps"].tolist() == [3] * 4
@@ -422,7 +386,7 @@ def test_a_huge_file_is_not_read(tmp_path, content, monkeypatch):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    config = small_config("hmappo")
+    config = small_run("hmappo")
     model, _ = run(folder, config, stop_at=32)
     write_yaml(folder / "config.yml", complete(config))
     return folder, model
@@ -442,7 +406,7 @@ def test_load_model(trained):
 
 
 def test_load_model_takes_the_best_weights_that_the_callback_wrote(tmp_path):
-    config = small_config("hmappo")
+    config = small_run("hmappo")
     env = make_env(config)
     model = make_model(config, env, "cpu")
     seen = []
@@ -470,7 +434,7 @@ def test_load_model_refuses(trained, tmp_path):
         load_model(tmp_path / "none")
     with pytest.raises(UsageError, match=r"model\.ckpt"):
         load_model(folder, best=True)
-    write_yaml(tmp_path / "config.yml", small_config("hmappo"))
+    write_yaml(tmp_path / "config.yml", small_run("hmappo"))
     with pytest.raises(UsageError, match="no checkpoint"):
         load_model(tmp_path)
 
@@ -479,7 +443,7 @@ def test_weights_of_another_configuration_are_refused(trained):
     folder, _ = trained
     _, checkpoint = CheckpointFolder(folder / "checkpoints").newest()
     for changes in ({"graph_width": 9}, {"share_encoders": True}):
-        config = small_config("hmappo", policy_kwargs={**TINY["RolePolicy"], **changes})
+        config = small_run("hmappo", policy_kwargs={**SMALL_POLICIES["RolePolicy"], **changes})
         model = make_model(config, make_env(config, 1), "cpu")
         before = {name: t.clone() for name, t in model.policy.state_dict().items()}
         with pytest.raises(CheckpointError, match="do not fit the configuration"):

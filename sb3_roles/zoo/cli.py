@@ -28,6 +28,7 @@ COMMANDS = (
     "sb3_roles.zoo.publish",
     "sb3_roles.zoo.ablations",
     "sb3_roles.zoo.bench",
+    "sb3_roles.prove.command",
 )
 EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
 

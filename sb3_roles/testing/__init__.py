@@ -1,0 +1,1 @@
+"""Conformance checks that anyone can call on an environment, a buffer or a loss of their own."""
