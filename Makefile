@@ -8,11 +8,13 @@ TORCH ?= torch==2.13.0
 STEPS ?= 400000
 # Further options of `make tables` and `make report`: TABLES=--quick takes minutes.
 TABLES ?=
+# Promises and options of `make prove`: PROVE=--quick takes minutes, PROVE="R1 R2" tries two.
+PROVE ?=
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install test check lint type format train enjoy tables report bench clean
+.PHONY: help install test check lint type format train enjoy tables report bench prove clean
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -57,6 +59,10 @@ format: $(STAMP) ## rewrite the code in the house format
 
 bench: $(STAMP) ## measure the speed of the environment and of training
 	$(BIN)/sb3-roles bench
+
+prove: $(STAMP) ## try what is promised about reliability, write results/reliability.md
+	mkdir -p results
+	$(BIN)/sb3-roles prove $(PROVE) -o results/reliability.md
 
 clean: ## remove the virtual environment and all caches
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
