@@ -32,7 +32,8 @@ from sb3_roles.zoo.config import write_yaml
 from sb3_roles.zoo.job import make_evaluate
 from sb3_roles.zoo.models import complete, load_model, make_env, make_model
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.training import CsvLog, StopSignals, train
+from sb3_roles.zoo.stop_signals import StopSignals
+from sb3_roles.zoo.training import CsvLog, train
 
 # 4 teams x 8 steps = 32 joint steps an iteration.
 N, CUT = 96, 32
