@@ -290,7 +290,7 @@ def test_a_failed_write_leaves_the_earlier_file(tmp_path, content, monkeypatch, 
 
 def test_the_last_ones_are_kept_and_remains_removed(tmp_path, content):
     folder = CheckpointFolder(tmp_path, keep=2)
-    (tmp_path / ".step_000000000001.ckpt.77.tmp").write_bytes(b"half")
+    (tmp_path / "step_000000000001.ckpt.77-ab.partial").write_bytes(b"half")
     folder.prepare()
     for step in (10, 20, 30):
         folder.save(step, **content)
