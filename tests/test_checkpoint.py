@@ -32,7 +32,8 @@ from sb3_roles.zoo.config import write_yaml
 from sb3_roles.zoo.job import make_evaluate
 from sb3_roles.zoo.models import complete, load_model, make_env, make_model
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.training import CsvLog, StopSignals, train
+from sb3_roles.zoo.stop_signals import StopSignals
+from sb3_roles.zoo.training import CsvLog, train
 
 # 4 teams x 8 steps = 32 joint steps an iteration.
 N, CUT = 96, 32
@@ -289,7 +290,7 @@ def test_a_failed_write_leaves_the_earlier_file(tmp_path, content, monkeypatch, 
 
 def test_the_last_ones_are_kept_and_remains_removed(tmp_path, content):
     folder = CheckpointFolder(tmp_path, keep=2)
-    (tmp_path / ".step_000000000001.ckpt.77.tmp").write_bytes(b"half")
+    (tmp_path / "step_000000000001.ckpt.77-ab.partial").write_bytes(b"half")
     folder.prepare()
     for step in (10, 20, 30):
         folder.save(step, **content)

@@ -14,7 +14,8 @@ from sb3_roles.gnn import GNN, GNNPolicy
 from sb3_roles.gnn.demonstrations import DemonstrationError
 from sb3_roles.gnn.recording import record
 from sb3_roles.mappo.policies import TeamActorCriticPolicy
-from sb3_roles.zoo.training import StopSignals, train
+from sb3_roles.zoo.stop_signals import StopSignals
+from sb3_roles.zoo.training import train
 
 
 def cloner(path, n_envs=2, patience=15, seed=0, **options):

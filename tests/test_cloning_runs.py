@@ -93,7 +93,7 @@ def test_a_batch_may_be_larger_than_what_is_played(capsys, tmp_path, demonstrati
 
 def test_a_run_of_the_defaults_is_evaluated_and_saved_often(capsys, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr("sb3_roles.zoo.job.run_job", lambda job: seen.append(job) or 0)
+    monkeypatch.setattr("sb3_roles.zoo.job.run_job", lambda job, stop: seen.append(job) or 0)
     for options in ([], ["--eval-freq", "70"]):
         assert call(capsys, tmp_path, options=options)[0] == 0
     assert main(["--algo", "mappo", "-f", str(tmp_path)], "train") == 0

@@ -238,7 +238,7 @@ def test_config_of_a_run_repeats_it(logs, tmp_path):
 def test_the_command_line_wins_over_the_config_of_a_run(logs, tmp_path, monkeypatch, capsys):
     file = str(logs[0] / "mappo" / "area-search-v0_1" / "config.yml")
     seen = []
-    monkeypatch.setattr(job, "run_job", lambda job: seen.append(job["config"]) or 0)
+    monkeypatch.setattr(job, "run_job", lambda job, stop: seen.append(job["config"]) or 0)
     assert main(["-conf", file, "--seed", "9", "--n-seeds", "2", "-n5"], "train") == 0
     assert main(["-conf", file, "--env", "toy_envs:PlainEnv", "-params",
                  "env_kwargs:null"], "train") == 0  # fmt: skip

@@ -75,14 +75,10 @@ def grown(array: np.ndarray, length: int) -> np.ndarray:
 
 def stacked(arrays: list[np.ndarray], fill: float) -> np.ndarray:
     """Stack arrays of different lengths, the shorter ones filled up at their end."""
-    longest = max((len(array) for array in arrays), default=0)
-    return np.array(
-        [
-            np.pad(
-                array,
-                [(0, longest - len(array))] + [(0, 0)] * (array.ndim - 1),
-                constant_values=fill,
-            )
-            for array in arrays
-        ]
-    )
+    if not arrays:
+        return np.array([])
+    longest = max(len(array) for array in arrays)
+    rows = np.full((len(arrays), longest, *arrays[0].shape[1:]), fill, arrays[0].dtype)
+    for row, array in zip(rows, arrays, strict=True):
+        row[: len(array)] = array
+    return rows

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 import warnings
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import safetensors
@@ -24,6 +23,7 @@ import safetensors.numpy
 import safetensors.torch
 import torch as th
 
+from sb3_roles.common.files import remove_partial, replace_file
 from sb3_roles.common.names import one_line
 
 FORMAT = "sb3_roles checkpoint"
@@ -142,29 +142,18 @@ def write_checkpoint(
         },
     }
     members = {MANIFEST: json.dumps(facts, indent=1).encode(), **members}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                for name, data in members.items():
-                    # A fixed date: equal states make equal files.
-                    archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
-            file.flush()
-            os.fsync(file.fileno())
-        if _read(temporary)[1] != {name: members[name] for name in members if name != MANIFEST}:
+
+    def write(file: IO[bytes]) -> None:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            for name, data in members.items():
+                # A fixed date: equal states make equal files.
+                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+
+    def check(written: Path) -> None:
+        if _read(written)[1] != {name: members[name] for name in members if name != MANIFEST}:
             raise CheckpointError(f"{path}: reads back differently from what was written")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    _sync_folder(path.parent)
 
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    replace_file(path, write, check)
 
 
 def _on_cpu(tensors: Mapping[str, th.Tensor]) -> dict[str, th.Tensor]:
@@ -260,8 +249,7 @@ class CheckpointFolder:
     def prepare(self) -> None:
         """Make the folder, and remove what killed writers left; for the owner of the run only."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        for stale in self.folder.glob(".*.tmp"):
-            stale.unlink(missing_ok=True)
+        remove_partial(self.folder)
 
     def paths(self) -> list[Path]:
         """Return the files, oldest first."""

@@ -7,6 +7,7 @@ optimizer, logs and environments as training that was never stopped.
 
 from __future__ import annotations
 
+import copy
 import platform
 import random
 import time
@@ -119,7 +120,7 @@ def _optimizer_tensors(model: OnPolicyAlgorithm) -> dict[str, th.Tensor]:
 
 
 def capture(model: OnPolicyAlgorithm, stateful: Sequence[Any] = ()) -> dict[str, Any]:
-    """Take a snapshot between two iterations.
+    """Take a snapshot between two iterations: copies, which do not change as training goes on.
 
     :param model: the algorithm, with its environment
     :param stateful: callbacks and writers with ``get_state()``
@@ -154,10 +155,14 @@ def capture(model: OnPolicyAlgorithm, stateful: Sequence[Any] = ()) -> dict[str,
         "rng": rng_state(),
     }
     return {
-        "policy": model.policy.state_dict(),
-        "optimizer": _optimizer_tensors(model),
-        "state": state,
+        "policy": _copied(model.policy.state_dict()),
+        "optimizer": _copied(_optimizer_tensors(model)),
+        "state": copy.deepcopy(state),
     }
+
+
+def _copied(tensors: Mapping[str, th.Tensor]) -> dict[str, th.Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
 
 
 def load_weights(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:

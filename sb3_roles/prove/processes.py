@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +22,27 @@ def environment(**variables: str) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", **variables}
 
 
-def words(*arguments: str | Path) -> list[str]:
+def words(*arguments: str | Path, module: str = "sb3_roles") -> list[str]:
     """Return the words that run a command of ``sb3-roles`` in a fresh interpreter.
 
     :param arguments: its name and options
+    :param module: to run instead of the package
     """
-    return [sys.executable, "-m", "sb3_roles", *map(str, arguments)]
+    return [sys.executable, "-m", module, *map(str, arguments)]
 
 
-def start(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.Popen[str]:
+def start(
+    *arguments: str | Path, cwd: Path, module: str = "sb3_roles", **variables: str
+) -> subprocess.Popen[str]:
     """Start a command, in a session of its own, its output in pipes.
 
     :param arguments: see :func:`words`
     :param cwd: folder to run it in
+    :param module: see :func:`words`
     :param variables: environment variables
     """
     return subprocess.Popen(
-        words(*arguments),
+        words(*arguments, module=module),
         cwd=cwd,
         env=environment(**variables),
         stdin=subprocess.DEVNULL,
@@ -47,18 +53,53 @@ def start(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.Pop
     )
 
 
+def kill_session(process: subprocess.Popen[str]) -> None:
+    """Kill a process of :func:`start` and all that it has started, as ``kill -9`` would.
+
+    :param process: may have ended
+    """
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+def left_behind(process: subprocess.Popen[str]) -> list[int]:
+    """Return processes of the session of one that has ended, where the system tells (Linux).
+
+    :param process: of :func:`start`
+    """
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        # One may end meanwhile.
+        with suppress(OSError):
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            # State, parent, group, session; a zombie has ended.
+            if int(fields[3]) == process.pid and fields[0] != "Z":
+                found.append(int(folder.name))
+    return found
+
+
 def finish(
-    *arguments: str | Path, cwd: Path, timeout: float = _TIMEOUT, **variables: str
+    *arguments: str | Path,
+    cwd: Path,
+    timeout: float = _TIMEOUT,
+    module: str = "sb3_roles",
+    **variables: str,
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end.
 
     :param arguments: see :func:`words`
     :param cwd: folder to run it in
     :param timeout: seconds
+    :param module: see :func:`words`
     :param variables: environment variables
     :raises subprocess.TimeoutExpired: if it takes longer
     """
     options: dict[str, Any] = {"cwd": cwd, "env": environment(**variables), "timeout": timeout}
     return subprocess.run(
-        words(*arguments), stdin=subprocess.DEVNULL, capture_output=True, text=True, **options
+        words(*arguments, module=module),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        **options,
     )

@@ -24,6 +24,7 @@ from sb3_roles.common import snapshot
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
 from sb3_roles.common.env_state import env_gap
+from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
 from sb3_roles.common.progress_callback import TeamProgressBar
@@ -43,33 +44,39 @@ from sb3_roles.zoo.models import check_device, complete, make_env, make_model, s
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ray_options import rollouts_on_ray
 from sb3_roles.zoo.run_folder import (
+    BEST,
     CHECKPOINTS,
     RunLock,
     new_run,
     note_command,
     write_description,
 )
-from sb3_roles.zoo.training import CsvLog, StopSignals, train
+from sb3_roles.zoo.stop_signals import StopSignals
+from sb3_roles.zoo.training import CsvLog, train
 
 # The periodic evaluation selects the best policy, on a stream that no --seed of a command reaches.
 _SELECTION_SEED, _FINAL_SEED = 0, 1
 _MAX_EVAL_TEAMS = 8
+SCORES_FILE = "evaluation.yml"
 
 
 class TrainingFailed(Exception):
     """Training can not go on, as when a loss is not finite; the message is one line."""
 
 
-def run_job(job: Mapping[str, Any]) -> int:
+def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
     """Train in a run folder, and evaluate.
 
     :param job: ``config``, ``options`` and ``resume``, plain data of ``zoo.train``, and where it is
         not this process's own ``command``, the words of a command line that repeats it
+    :param stop: of the command, which may have heard a signal already
     :return: exit code: 0, or 130 or 143 after a signal
+    :raises KeyboardInterrupt: after a signal before there was a run folder
     :raises UsageError: if environment, configuration or checkpoint do not fit
     :raises TrainingFailed: if a loss or reward is not finite, or the environment misbehaves
     """
     config, options = job["config"], job["options"]
+    stop = StopSignals() if stop is None else stop
     check_device(options["device"])
     if options["tensorboard_log"] is not None:
         if SummaryWriter is None:
@@ -83,10 +90,16 @@ def run_job(job: Mapping[str, Any]) -> int:
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
-        with rollouts_on_ray(model, config, options):
-            run, lock = _open_run(job)
+        # Ray has a handler of its own.
+        with rollouts_on_ray(model, config, options), stop.caught():
+            with stop.waiting():
+                run, lock = _open_run(job)
             try:
-                return _train_in(run, model, job)
+                stop.check()
+                return _train_in(run, model, job, stop)
+            except KeyboardInterrupt:
+                print(f"stopped; to go on: train.py --resume {run}", flush=True)
+                return stop.exit_code
             finally:
                 lock.release()
     finally:
@@ -101,8 +114,8 @@ def _ask(config: Mapping[str, Any], question: Callable[[], object]) -> None:
         raise UsageError(f"{config['algo']}: {one_line(error)}") from error
 
 
-def _get_demonstrations(run: Path, model: Any, job: Mapping[str, Any]) -> None:
-    """Read or record what is cloned, while Ctrl-C still stops at once, and note what it is."""
+def _get_demonstrations(run: Path, model: Any, job: Mapping[str, Any], new: bool) -> None:
+    """Read or record what is cloned, and note what it is."""
     config, options = job["config"], job["options"]
 
     def report(count: int) -> None:
@@ -116,7 +129,7 @@ def _get_demonstrations(run: Path, model: Any, job: Mapping[str, Any]) -> None:
         print(f"recording stopped; {run} keeps the episodes so far, and no policy", flush=True)
         raise
     print(model.summary(), flush=True)
-    if job["resume"] is None:
+    if new:
         write_yaml(run / "demonstrations.yml", model.facts)
 
 
@@ -126,12 +139,13 @@ def _open_run(job: Mapping[str, Any]) -> tuple[Path, RunLock]:
         path = Path(job["resume"])
         return path, RunLock(path)
     config, options = job["config"], job["options"]
-    path = new_run(Path(options["log_folder"]), config["algo"], config["env"])
-    lock = RunLock(path)
     args = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
     # A resumed run shall add in the same order, wherever it is resumed.
     args["num_threads"] = th.get_num_threads()
-    write_description(path, complete(config), args, _command(job))
+    whole = complete(config)
+    path = new_run(Path(options["log_folder"]), config["algo"], config["env"])
+    lock = RunLock(path)
+    write_description(path, whole, args, _command(job))
     return path, lock
 
 
@@ -139,18 +153,23 @@ def _command(job: Mapping[str, Any]) -> list[str]:
     return list(job.get("command") or [Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> int:
+def _train_in(
+    run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any], stop: StopSignals
+) -> int:
     config, options = job["config"], job["options"]
     checkpoints = CheckpointFolder(run / CHECKPOINTS)
     checkpoints.prepare()
+    for folder in (run, run / BEST):
+        remove_partial(folder)
     resume, begun = None, 0
-    if job["resume"] is not None:
+    if job["resume"] is not None and not checkpoints.paths() and not (run / SCORES_FILE).exists():
+        print(f"{run} has no checkpoint yet: it begins anew", flush=True)
+    elif job["resume"] is not None:
         resume, begun = _read_newest(checkpoints, model, config)
         if options.get("n_timesteps", begun) < begun:
             wanted = options["n_timesteps"]
             raise UsageError(f"{run} has {begun} joint steps already, more than -n {wanted}")
 
-    stop = StopSignals()
     with ExitStack() as stack:
         log = CsvLog(run / "progress.csv")
         logger = _logger(run, log, config, options)
@@ -159,31 +178,30 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
         callbacks = _callbacks(run, model, config, options, stack)
         _print_start(run, model, config, None if resume is None else begun)
         if get_algorithm(config["algo"]).clones:
-            _get_demonstrations(run, model, job)
+            _get_demonstrations(run, model, job, resume is None)
 
         def begin() -> None:
-            if resume is not None:
+            if job["resume"] is not None:
                 # A new n_timesteps is the run's from now on.
                 write_yaml(run / CONFIG_FILE, config)
                 note_command(run, _command(job))
 
         bar = [TeamProgressBar()] if options["progress"] else []
         try:
-            with stop.caught():
-                train(
-                    model,
-                    config["n_timesteps"],
-                    checkpoints,
-                    stop,
-                    [*callbacks, *bar],
-                    # An algorithm may know more than weights and counters.
-                    stateful=[log, *callbacks, *([model] if hasattr(model, "get_state") else [])],
-                    config=config,
-                    resume=resume,
-                    save_freq=options["save_freq"],
-                    log_interval=options["log_interval"],
-                    begin=begin,
-                )
+            steps = train(
+                model,
+                config["n_timesteps"],
+                checkpoints,
+                stop,
+                [*callbacks, *bar],
+                # An algorithm may know more than weights and counters.
+                stateful=[log, *callbacks, *([model] if hasattr(model, "get_state") else [])],
+                config=config,
+                resume=resume,
+                save_freq=options["save_freq"],
+                log_interval=options["log_interval"],
+                begin=begin,
+            )
         except CheckpointError as error:
             raise UsageError(f"{run}: {error}") from error
         except (FloatingPointError, ValueError) as error:
@@ -199,11 +217,8 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
             if "memory" not in str(error):
                 raise
             raise MemoryError(one_line(error)) from error
-    steps = model.num_timesteps // find_team_env(model.env).n_agents
     print(f"{run}: {steps} joint steps; checkpoints: {len(checkpoints.paths())}", flush=True)
-    if stop.received is not None:
-        print(f"stopped; to go on: train.py --resume {run}", flush=True)
-        return stop.exit_code
+    stop.check()
     _evaluate(run, model, config, options["eval_episodes"])
     return 0
 
@@ -301,7 +316,7 @@ def _evaluate(
     # A mix rounds them up to equal shares.
     n_episodes = int(scores["n_episodes"])
     about = {"episodes": n_episodes, "stream": "held_out", "seed": _FINAL_SEED}
-    write_yaml(run / "evaluation.yml", {**about, "scores": dict(scores)})
+    write_yaml(run / SCORES_FILE, {**about, "scores": dict(scores)})
     shown = ("explo_paper", "explo_true", "cover")
     if config["env"] == AREA_SEARCH:
         text = ", ".join(f"{name} {100 * scores[name]:.1f} %" for name in shown)

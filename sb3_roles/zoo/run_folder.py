@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sb3_roles._version import __version__
+from sb3_roles.common.files import append
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import folder_name
 from sb3_roles.zoo.launcher import process_settings
@@ -127,9 +128,10 @@ def write_description(
     :param args: the command line's options, as they were understood
     :param command: the command line
     """
-    write_yaml(run / CONFIG_FILE, config)
     write_yaml(run / ARGS_FILE, args)
     note_command(run, command)
+    # At last: a run that has it can be resumed.
+    write_yaml(run / CONFIG_FILE, config)
 
 
 def note_command(run: Path, command: Sequence[str]) -> None:
@@ -144,8 +146,7 @@ def note_command(run: Path, command: Sequence[str]) -> None:
     lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
     lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
     lines.append(f"# {process_settings()}")
-    with open(run / COMMAND_FILE, "a", encoding="utf-8") as file:
-        file.write("\n".join(lines) + "\n")
+    append(run / COMMAND_FILE, ("\n".join(lines) + "\n").encode())
 
 
 def _versions() -> list[str]:

@@ -24,6 +24,7 @@ from sb3_roles.zoo.options import (
     whole_number,
 )
 from sb3_roles.zoo.ray_options import add_ray_options, check_ray_options, connected_to
+from sb3_roles.zoo.stop_signals import StopSignals
 from sb3_roles.zoo.train_jobs import DEFAULTS, GIVEN, RunName, new_jobs, resumed_job
 
 if TYPE_CHECKING:
@@ -138,6 +139,16 @@ def run(args: argparse.Namespace) -> int:
         after a signal
     :raises UsageError: if the arguments do not go together
     """
+    stop = StopSignals()
+    try:
+        with stop.caught():
+            return _run(args, stop)
+    except KeyboardInterrupt:
+        print(f"{args.parser.prog}: stopped before a run was begun", file=sys.stderr)
+        return stop.exit_code
+
+
+def _run(args: argparse.Namespace, stop: StopSignals) -> int:
     given = {key: value for key, value in vars(args).items() if key in GIVEN and value is not None}
     runs: list[RunName] = []
     try:
@@ -153,12 +164,12 @@ def run(args: argparse.Namespace) -> int:
         return EXIT_ERROR
     prepare_process()
     if len(jobs) > 1 and "ray" in given:
-        return _fan_out(args, runs, jobs[0]["options"])
+        return _fan_out(args, runs, jobs[0]["options"], stop)
     from sb3_roles.zoo.job import TrainingFailed, run_job
 
     try:
         for job in jobs:
-            code = run_job(job)
+            code = run_job(job, stop)
             if code:
                 return code
     except TrainingFailed as error:
@@ -167,7 +178,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _fan_out(args: argparse.Namespace, runs: list[RunName], options: Mapping[str, Any]) -> int:
+def _fan_out(
+    args: argparse.Namespace, runs: list[RunName], options: Mapping[str, Any], stop: StopSignals
+) -> int:
     """Train all runs on a cluster."""
     cluster = connected_to(options["ray"])
     import torch as th
@@ -177,6 +190,11 @@ def _fan_out(args: argparse.Namespace, runs: list[RunName], options: Mapping[str
     # The same as here, where a run alone would take torch's choice: sums depend on it.
     n_threads = options["num_threads"] or th.get_num_threads()
     try:
-        return run_on_ray(args.arguments, [RunOf(*run) for run in runs], options, n_threads)
+        # Ray has a handler of its own.
+        with stop.caught():
+            return run_on_ray(args.arguments, [RunOf(*run) for run in runs], options, n_threads)
+    except KeyboardInterrupt:
+        print("stopped; each run goes on with: train.py --resume RUN", flush=True)
+        return stop.exit_code
     finally:
         cluster.disconnect()

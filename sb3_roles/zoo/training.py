@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import csv
-import signal
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -18,8 +14,11 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
-from sb3_roles.common.files import csv_bytes, write_atomically
+from sb3_roles.common.files import append, csv_bytes, write_atomically
 from sb3_roles.common.team_wrapper import find_team_env
+from sb3_roles.zoo.stop_signals import StopSignals
+
+_STOPPING = "stopping, this iteration will be repeated by --resume; again to stop at once"
 
 
 class CsvLog(KVWriter):
@@ -51,8 +50,7 @@ class CsvLog(KVWriter):
         if new:
             self._rewrite()
             return
-        with open(self.path, "ab") as file:
-            file.write(csv_bytes(self.rows[-1], []))
+        append(self.path, csv_bytes(self.rows[-1], []))
 
     def _rewrite(self) -> None:
         width = len(self.columns)
@@ -83,33 +81,24 @@ class CsvLog(KVWriter):
         self._rewrite()
 
 
-class StopSignals:
-    """Whether the user asked to stop."""
+class _Check(BaseCallback):
+    """Lets a signal that waited, as for a file to be written, stop the rollout."""
 
-    def __init__(self) -> None:
-        self.received: int | None = None
+    def __init__(self, stop: StopSignals) -> None:
+        super().__init__()
+        self._stop = stop
 
-    @contextmanager
-    def caught(self) -> Iterator[StopSignals]:
-        """Note the first SIGINT or SIGTERM instead of dying; the second one ends the program."""
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        earlier = [signal.signal(number, self._note) for number in numbers]
-        try:
-            yield self
-        finally:
-            for number, handler in zip(numbers, earlier, strict=True):
-                signal.signal(number, handler)
+    def _on_step(self) -> bool:
+        self._stop.check()
+        return True
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.received is not None:
-            raise SystemExit(128 + number)
-        self.received = number
-        print("stopping after this update; again to stop at once", file=sys.stderr, flush=True)
 
-    @property
-    def exit_code(self) -> int:
-        """0, 130 after SIGINT, 143 after SIGTERM."""
-        return 0 if self.received is None else 128 + self.received
+class _Boundary(NamedTuple):
+    """A run between two iterations."""
+
+    env_steps: int
+    content: dict[str, Any]
+    """of ``CheckpointFolder.save``"""
 
 
 def train(
@@ -125,15 +114,17 @@ def train(
     log_interval: int = 1,
     stop_at: int | None = None,
     begin: Callable[[], object] | None = None,
-) -> None:
+) -> int:
     """Train, and leave a checkpoint at the end, unless a callback has asked to stop.
 
-    Checkpoints are written between iterations only: after ``train()``, before the next rollout.
+    Checkpoints are of boundaries between iterations: after ``train()``, before the next rollout.
+    At each the run is copied. A signal breaks the iteration off, and the copy becomes the
+    checkpoint: who resumes it repeats the iteration, and ends in the same weights and logs.
 
     :param model: untrained, its logger set
     :param n_timesteps: joint steps of the whole run
     :param checkpoints: where to write them
-    :param stop: looked at between iterations
+    :param stop: whether there was a signal; the caller catches them
     :param callbacks: SB3's
     :param stateful: what has ``get_state()`` and ``set_state()``
     :param config: noted in the checkpoints
@@ -142,13 +133,15 @@ def train(
     :param log_interval: iterations between rows of the log
     :param stop_at: joint steps after which to stop early, as after a signal
     :param begin: called before the first step, when ``resume`` is known to fit
+    :return: joint steps of the run so far; after a signal those of the checkpoint
     :raises FloatingPointError: if the loss is not finite; nothing is saved then
     :raises CheckpointError: if ``resume`` does not fit
+    :raises KeyboardInterrupt: after a signal before the first iteration could begin, or without one
     """
     env: Any = model.env
     n_agents = find_team_env(env).n_agents
     total, callback = model._setup_learn(
-        n_timesteps * n_agents, CallbackList(list(callbacks)), True, "run"
+        n_timesteps * n_agents, CallbackList([*callbacks, _Check(stop)]), True, "run"
     )
     if resume is not None:
         snapshot.restore(model, resume)
@@ -159,9 +152,12 @@ def train(
     if begin is not None:
         begin()
     per_iteration = model.n_steps * env.num_envs
-    saved = model.num_timesteps
+    limit = total if stop_at is None else min(total, stop_at * n_agents)
+    begun = model.num_timesteps // n_agents
+    saved = None if resume is None else begun
+    boundary: _Boundary | None = None
 
-    def save() -> None:
+    def take() -> _Boundary:
         env_steps = model.num_timesteps // n_agents
         manifest = {
             "config": dict(config or {}),
@@ -169,27 +165,44 @@ def train(
             "env_steps": env_steps,
             "agent_steps": model.num_timesteps,
         }
-        checkpoints.save(env_steps, manifest=manifest, **snapshot.capture(model, stateful))
+        return _Boundary(env_steps, {"manifest": manifest, **snapshot.capture(model, stateful)})
 
-    limit = total if stop_at is None else min(total, stop_at * n_agents)
-    # An algorithm may be finished before its time: early stopping.
-    while not (
-        model.num_timesteps >= limit
-        or stop.received is not None
-        or getattr(model, "finished", False)
-    ):
-        # Returns False when a callback asks to stop, in the middle of a rollout.
-        if not model.collect_rollouts(env, callback, model.rollout_buffer, model.n_steps):
-            break
-        model._update_current_progress_remaining(model.num_timesteps, total)
-        iteration = model.num_timesteps // per_iteration
-        if iteration % log_interval == 0:
-            model.dump_logs(iteration)
-        model.train()
-        if save_freq and (model.num_timesteps - saved) >= save_freq * n_agents:
-            save()
-            saved = model.num_timesteps
+    def save(one: _Boundary) -> int:
+        checkpoints.save(one.env_steps, **one.content)
+        return one.env_steps
+
+    stop.message = _STOPPING
+    try:
+        with stop.held():
+            boundary = take()
+        # An algorithm may be finished before its time: early stopping.
+        while not (model.num_timesteps >= limit or getattr(model, "finished", False)):
+            # Returns False when a callback asks to stop, in the middle of a rollout.
+            if not model.collect_rollouts(env, callback, model.rollout_buffer, model.n_steps):
+                break
+            model._update_current_progress_remaining(model.num_timesteps, total)
+            iteration = model.num_timesteps // per_iteration
+            if iteration % log_interval == 0:
+                model.dump_logs(iteration)
+            # Of a signal that came while a file was written.
+            stop.check()
+            model.train()
+            with stop.held():
+                boundary = take()
+                if save_freq and boundary.env_steps - (saved or begun) >= save_freq:
+                    saved = save(boundary)
+        else:
+            if saved != boundary.env_steps:
+                with stop.held():
+                    saved = save(boundary)
+    except KeyboardInterrupt:
+        if stop.received is None or boundary is None:
+            raise
+        if saved != boundary.env_steps:
+            save(boundary)
+        env_steps = boundary.env_steps
     else:
-        if model.num_timesteps > saved or not checkpoints.paths():
-            save()
+        env_steps = model.num_timesteps // n_agents
+    stop.message = ""
     callback.on_training_end()
+    return env_steps

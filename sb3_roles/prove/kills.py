@@ -1,0 +1,278 @@
+"""Kills and signals: what a run, and a folder of checkpoints, is after them (R1, R3, R15)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_roles.common.checkpoint import CheckpointFolder
+from sb3_roles.prove import processes, watched
+from sb3_roles.prove.promises import Outcome, Setting
+from sb3_roles.prove.small_runs import ITERATION, small_settings
+from sb3_roles.prove.training_runs import checkpoint_difference, log_difference
+from sb3_roles.prove.watched import BETWEEN, IMPORT, START, Board
+from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
+from sb3_roles.zoo.job import SCORES_FILE
+from sb3_roles.zoo.models import load_model
+from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS
+
+WATCHED = "sb3_roles.prove.watched"
+SAVE_LOOPS = "sb3_roles.prove.save_loops"
+ALGO, ENV = "hmappo", "area-search-v0"
+_DEADLINE = 300.0
+_ALLOWED = 10.0
+"""Seconds from a signal to the end."""
+# How long after a phase was entered a signal comes, at most, in seconds: about as long as it takes.
+_WITHIN = {
+    START: 4.0,
+    watched.ROLLOUT: 0.03,
+    watched.UPDATE: 0.06,
+    watched.SAVE: 0.004,
+    watched.EVALUATION: 0.05,
+    watched.FINAL: 0.05,
+}
+
+
+class Trainee:
+    """A run in processes of its own.
+
+    :param folder: of its own
+    :param settings: of a configuration file
+    :param options: of the command
+    """
+
+    def __init__(self, folder: Path, settings: dict[str, Any], *options: str) -> None:
+        folder.mkdir(parents=True)
+        self.folder, self._options = folder, options
+        self._config = folder / "given.yml"
+        write_yaml(self._config, {ENV: settings})
+        self.board = Board(folder / "board")
+
+    @property
+    def run(self) -> Path | None:
+        """The run folder that can be resumed; None before there is one."""
+        made = sorted(self.folder.glob(f"logs/{ALGO}/*/{CONFIG_FILE}"))
+        return made[-1].parent if made else None
+
+    def start(self) -> subprocess.Popen[str]:
+        """Begin the run, or go on with it."""
+        words: list[str | Path] = ["train", "-conf", self._config, "--algo", ALGO, "--seed", "3"]
+        words += ["-f", self.folder / "logs", "--device", "cpu", "--num-threads", "1"]
+        words += self._options
+        if self.run is not None:
+            words = ["train", "--resume", self.run]
+        self.board.write(IMPORT)
+        return processes.start(
+            self.folder / "board", *words, "--verbose", "0", cwd=self.folder, module=WATCHED
+        )
+
+    def wait_for(
+        self, process: subprocess.Popen[str], phase: str, visits: int, within: float
+    ) -> str | None:
+        """Wait until a process is in a phase, and a while longer.
+
+        :param phase: ``start`` counts from the first import on
+        :param visits: how often it must have been entered
+        :param within: seconds to wait further
+        :return: what the process is doing then; None if it has ended
+        """
+        deadline, seen, last = time.monotonic() + _DEADLINE, 0, -1
+        while phase != START and seen < visits and process.poll() is None:
+            now = self.board.read()
+            if now.phase == phase and now.entered != last:
+                seen, last = seen + 1, now.entered
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"no {phase} in {_DEADLINE:.0f} s")
+            time.sleep(0.0005)
+        until = time.monotonic() + within
+        while time.monotonic() < until and process.poll() is None:
+            time.sleep(0.0005)
+        return self.board.read().phase if process.poll() is None else None
+
+
+def _counted(names: list[str]) -> str:
+    return ", ".join(f"{n} in {name}" for name, n in sorted(Counter(names).items()))
+
+
+def _last_line(text: str) -> str:
+    return text.strip().splitlines()[-1] if text.strip() else "no message"
+
+
+# R1
+
+
+def restarts(setting: Setting) -> Outcome:
+    """Kill a run again and again, restart it each time, and compare it with one left alone (R1).
+
+    :param setting: the short form kills twice
+    """
+    rng = np.random.default_rng([setting.seed, 1])
+    kinds = [START, watched.ROLLOUT, watched.UPDATE, watched.SAVE, watched.EVALUATION]
+    phases = [watched.UPDATE, watched.SAVE]
+    if not setting.quick:
+        phases = [*rng.permutation([*kinds * 3, *kinds[:4]]), watched.FINAL]
+    settings = small_settings(ALGO, 5 * len(phases), learning_rate=1e-3)
+    options = ["--save-freq", str(ITERATION), "--eval-freq", str(2 * ITERATION)]
+    options += ["--eval-episodes", "4"]
+    alone, killed = (
+        Trainee(setting.folder / name, settings, *options) for name in ("alone", "killed")
+    )
+    undisturbed = alone.start()
+    hit: list[str] = []
+    failures: list[str] = []
+    for phase in phases:
+        process = killed.start()
+        visits = int(rng.integers(1, 4)) if phase in kinds[1:] else 1
+        killed.wait_for(process, phase, visits, float(rng.uniform(0, _WITHIN[phase])))
+        ended = process.poll() is not None
+        processes.kill_session(process)
+        if ended:
+            failures.append(f"restart {len(hit) + 1} ended by itself, code {process.returncode}")
+            break
+        # Now that it is dead it can not go on to another one.
+        hit.append(killed.board.read().phase)
+        setting.note(f"killed in {hit[-1]}")
+    for one, process in ((killed, killed.start()), (alone, undisturbed)):
+        _, error = process.communicate(timeout=_DEADLINE)
+        if process.returncode:
+            failures.append(f"{one.folder.name}: code {process.returncode}: {_last_line(error)}")
+    if not failures:
+        found = run_difference(alone.run, killed.run)
+        failures += [] if found is None else [f"the runs differ in {found}"]
+    held = 0 if failures else len(hit)
+    said = f"kills survived, identical ({_counted(hit)})"
+    return Outcome(held, len(phases), said, tuple(failures), "no resume: begins anew")
+
+
+def run_difference(a: Path | None, b: Path | None) -> str | None:
+    """Return what differs between two finished runs, but for times; None for nothing.
+
+    :param a: a run folder
+    :param b: the other one
+    """
+    if a is None or b is None:
+        return "their being there"
+    newest = [CheckpointFolder(run / CHECKPOINTS).newest()[1] for run in (a, b)]
+    found = checkpoint_difference(*newest) or log_difference(a, b)
+    if found is None:
+        same = (SCORES_FILE, CONFIG_FILE, f"{BEST}/model.ckpt")
+        return next((n for n in same if (a / n).read_bytes() != (b / n).read_bytes()), None)
+    return found
+
+
+# R15
+
+
+def terminations(setting: Setting) -> Outcome:
+    """Send SIGTERM, and now and then SIGINT, to training processes (R15).
+
+    :param setting: the short form sends two
+    """
+    rng = np.random.default_rng([setting.seed, 15])
+    long = [START] * 5 + [watched.ROLLOUT] * 4 + [watched.UPDATE] * 5
+    short = [watched.SAVE, watched.EVALUATION, watched.FINAL] * 2
+    phases = list(rng.permutation([*long, *short]))
+    numbers = [signal.SIGINT if i % 4 == 3 else signal.SIGTERM for i in range(len(phases))]
+    if setting.quick:
+        phases, numbers = [watched.UPDATE, watched.FINAL], [signal.SIGTERM, signal.SIGINT]
+    hit, times, failures = [], [], []
+    held = 0
+    for i, (phase, number) in enumerate(zip(phases, numbers, strict=True)):
+        trainee = _terminee(setting.folder / f"trial_{i}", phase in long)
+        process = trainee.start()
+        visits = int(rng.integers(1, 3)) if phase == watched.SAVE else 1
+        within = _WITHIN[phase] if phase not in long else 2.0
+        where = trainee.wait_for(process, phase, visits, float(rng.uniform(0, within)))
+        begun = time.monotonic()
+        process.send_signal(number)
+        try:
+            _, error = process.communicate(timeout=_DEADLINE)
+        finally:
+            orphans = processes.left_behind(process)
+            processes.kill_session(process)
+        times.append(time.monotonic() - begun)
+        problems = _stopped_badly(trainee, process, number, error)
+        if where is None:
+            problems.append("it ended before the signal")
+        if times[-1] > _ALLOWED:
+            problems.append(f"took {times[-1]:.1f} s")
+        if orphans:
+            problems.append(f"left processes {orphans}")
+        hit.append(where or "nothing")
+        setting.note(f"{signal.Signals(number).name} in {where}: out in {times[-1]:.1f} s")
+        held += not problems
+        failures += [f"{signal.Signals(number).name} in {where}: {one}" for one in problems]
+        trainee.board.close()
+        shutil.rmtree(trainee.folder)
+    said = f"signals, out in at most {max(times):.1f} s ({_counted(hit)})"
+    return Outcome(held, len(phases), said, tuple(failures))
+
+
+def _terminee(folder: Path, long: bool) -> Trainee:
+    """Make a run whose first iteration takes much longer than is allowed, or one of short ones."""
+    if long:
+        settings = small_settings(ALGO, 500, n_steps=400, n_epochs=50)
+        return Trainee(folder, settings, "--eval-freq", "0")
+    options = ["--save-freq", str(ITERATION), "--eval-freq", str(ITERATION)]
+    return Trainee(folder, small_settings(ALGO, 3), *options, "--eval-episodes", "60")
+
+
+def _stopped_badly(
+    trainee: Trainee, process: subprocess.Popen[str], number: int, error: str
+) -> list[str]:
+    """Return what is wrong with a process that was stopped, and what it left."""
+    found = []
+    run = trainee.run
+    if process.returncode == -number:
+        # Before the program could handle signals; then nothing may be there.
+        if trainee.board.read().phase not in (IMPORT, BETWEEN):
+            found.append("died of the signal")
+    elif process.returncode != 128 + number:
+        found.append(f"exit code {process.returncode}: {_last_line(error)}")
+    elif len(error.splitlines()) > 1:
+        found.append(f"{len(error.splitlines())} lines: {_last_line(error)}")
+    partial = [path.name for path in trainee.folder.rglob("*.partial")]
+    found += [f"left {name}" for name in partial]
+    made = list(trainee.folder.glob(f"logs/{ALGO}/*"))
+    if run is None and made:
+        found.append(f"left half a run folder, {made[0].name}")
+    if run is not None:
+        try:
+            load_model(run, device="cpu")
+        except UsageError as problem:
+            if CheckpointFolder(run / CHECKPOINTS).paths() or "\n" in str(problem):
+                found.append(f"does not load: {problem}")
+    return found
+
+
+# R3
+
+
+def saves(setting: Setting) -> Outcome:
+    """Kill loops of saves, and read what they have left (R3).
+
+    :param setting: the short form kills ten
+    """
+    n_trials = 10 if setting.quick else 200
+    arguments = (setting.folder, str(setting.seed), str(n_trials))
+    done = processes.finish(*arguments, cwd=setting.folder, module=SAVE_LOOPS)
+    if done.returncode:
+        return Outcome(0, n_trials, "the loops broke", (_last_line(done.stderr),))
+    found = json.loads(done.stdout)
+    said = f"kills survived, {found['inside']} of them in the middle of a write"
+    return Outcome(
+        n_trials - len(found["failures"]),
+        n_trials,
+        said,
+        tuple(found["failures"]),
+        f"{found['unreadable']} of {n_trials} files unreadable",
+    )
