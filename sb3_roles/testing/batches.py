@@ -44,7 +44,7 @@ def check_batched_equals_single(
     for m, moment in enumerate(last):
         _compare_observations(batch, m, moment)
     for _ in range(n_steps):
-        chosen = [draws.draw(*pair) for draws, pair in zip(actions, zip(singles, last), strict=True)]
+        chosen = [a.draw(*env) for a, *env in zip(actions, singles, last, strict=True)]
         moves = np.array([[one[agent] for agent in one] for one in chosen])
         guard(f"step {last[0].step + 1} of the batch", batch.step, moves)
         last = [step(*both) for both in zip(singles, last, chosen, strict=True)]

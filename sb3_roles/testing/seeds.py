@@ -147,10 +147,7 @@ def check_state_round_trip(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int
     """
     for cut in (0, n_steps // 7 + 1, n_steps):
         env, other = make_env(), make_env()
-        last = None
-        for last in play(env, cut, seed):
-            pass
-        assert last is not None
+        *_, last = play(env, cut, seed)
         state = env.get_state()
         copied = frozen(state)
         reset(other, seed=seed + 1)
