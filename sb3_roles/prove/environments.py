@@ -57,9 +57,10 @@ def _watched_parts(quick: bool) -> Iterator[_Part]:
         teams = -(-_QUICK_JOINT_STEPS // (len(scenes) * _STEPS))
         for i, scene in enumerate(scenes):
             sub_goal, _, options = _VARIANTS[(i + i // len(ROBOTS)) % len(_VARIANTS)]
-            few = sub_goal == "routes"
-            size = (1, _STEPS // 8) if few else (2 * teams + 4, _STEPS // 2)
-            yield _Part(scene.with_options(**options), sub_goal, *size, i)
+            size = (1, _STEPS // 8) if sub_goal == "routes" else (4 * teams + 7, _STEPS // 4)
+            # Short episodes, so that some of them end.
+            short = scene.with_options(horizon=_STEPS // 5, **options)
+            yield _Part(short, sub_goal, *size, i)
         return
     for i, scene in enumerate(scenes):
         for k, (sub_goal, share, options) in enumerate(_VARIANTS):
@@ -140,7 +141,9 @@ def _compared_parts(quick: bool) -> Iterator[_Part]:
         robots, number = ROBOTS.index(scene.n_agents), i * len(_COMPARED)
         if quick:
             sub_goal = list(_COMPARED)[(i + i // len(ROBOTS)) % len(_COMPARED)]
-            steps = 1 if sub_goal == "routes" else -(-_QUICK_REFERENCE_STEPS * 4 // 3 // len(scenes))
+            steps = (
+                1 if sub_goal == "routes" else -(-_QUICK_REFERENCE_STEPS * 4 // 3 // len(scenes))
+            )
             yield _Part(scene.with_options(horizon=_SHORT), sub_goal, 1, steps, number)
             continue
         for k, (sub_goal, share) in enumerate(_COMPARED.items()):

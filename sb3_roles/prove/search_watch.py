@@ -235,5 +235,3 @@ class Watch:
                 )
         self.broken += int(broken.sum())
         return lines
-
-

@@ -122,9 +122,7 @@ def check_no_aliasing(make_env: MakeEnv, n_steps: int = 200, seed: int = 0) -> N
                             f"the {moment.where} (before and now: {text}); return a copy"
                         )
         kept.append((moment, frozen(moment)))
-    plays = zip(
-        play(make_env(), n_steps, seed), play(make_env(), n_steps, seed), strict=True
-    )
+    plays = zip(play(make_env(), n_steps, seed), play(make_env(), n_steps, seed), strict=True)
     for spoiled, other in plays:
         compare(spoiled, other, "writing into what was returned before reached the environment")
         for part in spoiled.parts().values():

@@ -195,9 +195,7 @@ def difference(first: Any, second: Any, path: str = "") -> str | None:
     elif isinstance(first, (list, tuple)) and isinstance(second, (list, tuple)):
         if len(first) != len(second):
             return f"{label} has {len(first)} and {len(second)} entries"
-        pairs = (
-            (f"{path}[{i}]", a, b) for i, (a, b) in enumerate(zip(first, second, strict=True))
-        )
+        pairs = ((f"{path}[{i}]", a, b) for i, (a, b) in enumerate(zip(first, second, strict=True)))
     else:
         both_nan = first != first and second != second
         return None if both_nan or first == second else f"{label} is {first!r} and {second!r}"
