@@ -32,7 +32,7 @@ from sb3_roles.zoo.ablation_runs import (
     missing_lines,
     train_missing,
 )
-from sb3_roles.zoo.cli import main, make_parser
+from sb3_roles.zoo.cli import make_parser
 from sb3_roles.zoo.config import config_file, read_yaml
 from sb3_roles.zoo.models import make_env, make_model, small_config
 from sb3_roles.zoo.row_configs import config_of_row, method_of_row
@@ -277,19 +277,15 @@ def test_what_is_trained_is_what_the_command_says(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def tell(tmp_path, capsys, monkeypatch):
-    """Run the command in this process: exit code, and the lines of its two outputs."""
+def tell(tell, tmp_path, monkeypatch):
+    """Run the command in an empty folder: exit code, and the lines of its two outputs."""
     monkeypatch.chdir(tmp_path)
 
     def run(*args: str, **changes: Any) -> tuple[int, list[str], list[str]]:
         (tmp_path / "plan.yml").write_text(yaml.safe_dump(data(**changes)))
         plan = () if "--plan" in args else ("--plan", "plan.yml")
-        try:
-            code = main(["ablations", *plan, *args])
-        except SystemExit as error:
-            code = int(error.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out.splitlines(), captured.err.splitlines()
+        code, out, err = tell("ablations", *plan, *args)
+        return code, out.splitlines(), err.splitlines()
 
     return run
 

@@ -82,15 +82,11 @@ def test_memory_is_compared_with_a_stock_buffer(capsys):
         (["--json", "--markdown"], "not allowed with"),
     ],
 )
-def test_wrong_options_are_one_line(capsys, options, message):
-    try:
-        code = main(["bench", "train", *options])
-    except SystemExit as stop:
-        code = stop.code
-    captured = capsys.readouterr()
+def test_wrong_options_are_one_line(tell, options, message):
+    code, printed, error = tell("bench", "train", *options)
     assert code == 2
-    assert message in captured.err and "Traceback" not in captured.err
-    assert captured.out == ""
+    assert message in error and "Traceback" not in error
+    assert printed == ""
 
 
 def test_markdown_has_every_table(capsys):

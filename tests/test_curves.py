@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -128,17 +129,13 @@ def test_a_plot_is_drawn(tmp_path: Path) -> None:
 )
 def test_bad_input_is_one_line(
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    tell: Callable[..., tuple[int, str, str]],
     covers: list[float | str],
     arguments: list[str],
     message: str,
 ) -> None:
     run = make_run(tmp_path / "a", "hmappo", covers)
-    try:
-        code = main(["curves", run, *arguments])
-    except SystemExit as stop:
-        code = stop.code  # type: ignore[assignment]
-    error = capsys.readouterr().err
+    code, _, error = tell("curves", run, *arguments)
     assert code == 2
     assert message in error
     assert error.count("\n") == 1

@@ -57,21 +57,6 @@ def ship(folder, tmp_path, monkeypatch):
     return tmp_path / "package"
 
 
-@pytest.fixture
-def tell(capsys):
-    """Run a command in this process: exit code, and what it prints."""
-
-    def run(*args: object) -> tuple[int, str, str]:
-        try:
-            code = main([str(arg) for arg in args])
-        except SystemExit as error:
-            code = int(error.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
-
-
 # What the package holds
 
 

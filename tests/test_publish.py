@@ -22,7 +22,7 @@ from sb3_roles.evaluation.records import read_records
 from sb3_roles.zoo import staging
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.card_scores import merged
-from sb3_roles.zoo.cli import main, make_parser
+from sb3_roles.zoo.cli import make_parser
 from sb3_roles.zoo.config import read_run_config, resolve
 from sb3_roles.zoo.loaded_run import load_run
 from sb3_roles.zoo.model_card import CARD, check_files, read_card, render
@@ -41,19 +41,10 @@ def runs(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def tell(tmp_path, capsys, monkeypatch):
-    """Run a command in this process: exit code, and what it prints."""
+def tell(tell, tmp_path, monkeypatch):
+    """Run commands in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*args: object) -> tuple[int, str, str]:
-        try:
-            code = main([str(arg) for arg in args])
-        except SystemExit as error:
-            code = int(error.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
+    return tell
 
 
 def files_below(folder: Path) -> dict[str, bytes]:

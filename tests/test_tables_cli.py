@@ -48,17 +48,13 @@ def plan(tmp_path) -> str:
 
 
 @pytest.fixture
-def tell(tmp_path, capsys, monkeypatch):
-    """Run the command in this process: exit code, and the lines of its two outputs."""
+def tell(tell, tmp_path, monkeypatch):
+    """Run the command in an empty folder: exit code, and the lines of its two outputs."""
     monkeypatch.chdir(tmp_path)
 
     def run(*args: str, command: str = "tables") -> tuple[int, list[str], list[str]]:
-        try:
-            code = main([command, *args])
-        except SystemExit as error:
-            code = int(error.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out.splitlines(), captured.err.splitlines()
+        code, out, err = tell(command, *args)
+        return code, out.splitlines(), err.splitlines()
 
     return run
 

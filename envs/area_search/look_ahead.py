@@ -19,7 +19,6 @@ from numba import njit
 from area_search.cells import KNOWN_TARGET, N_ACTIONS
 from area_search.look_ahead_data import (
     NONE,
-    TARGET_WORTH,
     WORTH_SCALE,
     Labels,
     Marks,
@@ -30,13 +29,6 @@ from area_search.look_ahead_data import (
 )
 from area_search.look_ahead_search import forget, keep, search
 from area_search.paths import encode
-
-
-@njit(cache=True)
-def place(stride: int, border: int, position: np.ndarray, starts: np.ndarray) -> None:
-    """Write the robots' cells in the flat padded map, int64 (n_agents,)."""
-    for i in range(starts.shape[0]):
-        starts[i] = (position[i, 0] + border) * stride + position[i, 1] + border
 
 
 @njit(cache=True, inline="always")
@@ -52,9 +44,7 @@ def _claim_cell(
 
 
 @njit(cache=True)
-def _claim(
-    cells: np.ndarray, i: int, target: int, sees: bool, rules: Rules, routes: Routes, marks: Marks
-) -> None:
+def _claim(cells: np.ndarray, i: int, rules: Rules, routes: Routes, marks: Marks) -> None:
     """Claim for a robot what its route gets, with the discount at which it gets it."""
     discounts, disc = rules.discounts, rules.disc
     last, firm = discounts.shape[0] - 1, discounts[rules.firm]
@@ -62,9 +52,9 @@ def _claim(
     for k in range(routes.lengths[i]):
         cell = route[i, k]
         discount = discounts[min(k + 1, last)]
-        if target > 0 and cells[cell] & KNOWN_TARGET:
+        if cells[cell] & KNOWN_TARGET:
             _claim_cell(i, cell, discount, firm, marks, robbed)
-        if sees and sight[cell] > 0:
+        if sight[cell] > 0:
             for q in range(disc.shape[0]):
                 seen = cell + disc[q]
                 if unseen[seen] > 0:
@@ -72,20 +62,18 @@ def _claim(
 
 
 @njit(cache=True)
-def _release(i: int, sees: bool, disc: np.ndarray, routes: Routes, marks: Marks) -> None:
+def _release(i: int, disc: np.ndarray, routes: Routes, marks: Marks) -> None:
     """Free what a robot's route gets, for whoever claimed it."""
     for k in range(routes.lengths[i]):
         cell = routes.cells[i, k]
         marks.claims[cell] = 0
-        if sees and marks.sight[cell] > 0:
+        if marks.sight[cell] > 0:
             for q in range(disc.shape[0]):
                 marks.claims[cell + disc[q]] = 0
 
 
 @njit(cache=True)
-def _settle(
-    cells: np.ndarray, target: int, sees: bool, rules: Rules, routes: Routes, marks: Marks
-) -> int:
+def _settle(cells: np.ndarray, rules: Rules, routes: Routes, marks: Marks) -> int:
     """Return what the routes of a team are worth together; all claims are free then."""
     claims, unseen = marks.claims, marks.unseen
     total = 0
@@ -93,9 +81,9 @@ def _settle(
         for k in range(routes.lengths[i]):
             cell = routes.cells[i, k]
             if cells[cell] & KNOWN_TARGET:
-                total += target * claims[cell]
+                total += rules.target * claims[cell]
                 claims[cell] = 0
-            if sees and marks.sight[cell] > 0:
+            if marks.sight[cell] > 0:
                 for q in range(rules.disc.shape[0]):
                     seen = cell + rules.disc[q]
                     if unseen[seen] > 0:
@@ -106,18 +94,10 @@ def _settle(
 
 @njit(cache=True)
 def _plan_in_turn(
-    first: int,
-    cells: np.ndarray,
-    starts: np.ndarray,
-    target: int,
-    sees: bool,
-    rules: Rules,
-    marks: Marks,
-    labels: Labels,
-    routes: Routes,
+    first: int, cells: np.ndarray, rules: Rules, marks: Marks, labels: Labels, routes: Routes
 ) -> int:
     """Plan one after the other, a given robot first; return what all routes are worth together."""
-    n_agents = starts.shape[0]
+    n_agents = routes.starts.shape[0]
     routes.lengths[:] = 0
     for turn in range(rules.rounds * n_agents):
         i = (first + turn) % n_agents
@@ -125,50 +105,54 @@ def _plan_in_turn(
             if not routes.robbed[i]:
                 continue
             for j in range(n_agents):
-                _release(j, sees, rules.disc, routes, marks)
+                _release(j, rules.disc, routes, marks)
             for j in range(n_agents):
                 if j != i:
-                    _claim(cells, j, target, sees, rules, routes, marks)
+                    _claim(cells, j, rules, routes, marks)
         routes.robbed[i] = False
-        n_labels, top = search(cells, starts[i], target, sees, 1, rules, marks, labels)
+        n_labels, top = search(cells, routes.starts[i], 1, rules, marks, labels)
         if top == 0:
-            n_labels, top = search(cells, starts[i], target, sees, 0, rules, marks, labels)
+            n_labels, top = search(cells, routes.starts[i], 0, rules, marks, labels)
         keep(i, n_labels, top, labels, routes)
-        _claim(cells, i, target, sees, rules, routes, marks)
-    return _settle(cells, target, sees, rules, routes, marks)
+        _claim(cells, i, rules, routes, marks)
+    return _settle(cells, rules, routes, marks)
 
 
 @njit(cache=True)
 def plan_routes(
     cells: np.ndarray,
-    starts: np.ndarray,
-    target: int,
-    sees: bool,
-    rules: Rules,
+    border: int,
+    position: np.ndarray,
+    steps: int,
+    timetable: Timetable,
     marks: Marks,
     labels: Labels,
     routes: Routes,
 ) -> None:
     """Plan the routes of a team.
 
-    :param cells: uint8 (n,), the padded map, flat
-    :param starts: int64 (n_agents,), the cells of the robots
-    :param target: worth of a known target, ``TARGET_WORTH`` or 0
-    :param sees: whether unseen cells are worth anything
-    :param marks: those of this map, or fresh ones; to be forgotten when the map changes
+    :param cells: uint8 (height + 2 border, width + 2 border), its map
+    :param position: int32 (n_agents, 2)
+    :param steps: of its episode so far
     :param routes: overwritten; a robot for which team mates leave nothing plans as if it were
         alone, and if nothing can be reached its route is empty
     """
+    starts = routes.starts
+    for i in range(starts.shape[0]):
+        starts[i] = (position[i, 0] + border) * cells.shape[1] + position[i, 1] + border
+    rules = rules_at(timetable, timetable.rules.left - steps)
+    flat = cells.reshape(-1)
     n_orders = min(rules.orders, starts.shape[0])
     best_total, best = -1, 0
     for order in range(n_orders):
         # The plan that is begun by the first robot comes last: often it needs no other.
         first = n_orders - 1 - order
-        total = _plan_in_turn(first, cells, starts, target, sees, rules, marks, labels, routes)
+        total = _plan_in_turn(first, flat, rules, marks, labels, routes)
         if total >= best_total:
             best_total, best = total, first
     if best > 0:
-        _plan_in_turn(best, cells, starts, target, sees, rules, marks, labels, routes)
+        _plan_in_turn(best, flat, rules, marks, labels, routes)
+    forget(marks)
 
 
 @njit(cache=True, nogil=True)
@@ -182,7 +166,6 @@ def route_goals(
     marks: Marks,
     labels: Labels,
     routes: Routes,
-    starts: np.ndarray,
     table: np.ndarray,
     out: np.ndarray,
 ) -> None:
@@ -192,7 +175,6 @@ def route_goals(
     :param cells: uint8 (n_teams, height + 2 border, width + 2 border)
     :param position: int32 (n_teams, n_agents, 2)
     :param steps: int32 (n_teams,), steps of the episodes so far
-    :param starts: int64 (n_agents,), scratch
     :param table: int64, see :func:`~area_search.paths.discount_table`
     :param out: float32 (n_teams, n_agents, rows, 11); the last row is overwritten: five flags of
         the moves with which the robot's route can begin, ``0.9 ** steps`` until it gets anything,
@@ -202,11 +184,7 @@ def route_goals(
     for m in range(position.shape[0]):
         if not which[m]:
             continue
-        flat = cells[m].reshape(-1)
-        place(cells.shape[2], border, position[m], starts)
-        rules = rules_at(timetable, timetable.rules.left - steps[m])
-        plan_routes(flat, starts, TARGET_WORTH, True, rules, marks, labels, routes)
-        forget(marks)
+        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, routes)
         for i in range(position.shape[1]):
             features = out[m, i, row]
             begin = routes.begin[i] if routes.lengths[i] > 0 else NONE

@@ -63,8 +63,9 @@ class Rules(NamedTuple):
     int64 (5, k) and ``edge_counts`` int64 (5,), of the cells that come into view with each action,
     see :func:`~area_search.cells.edge_offsets`; ``discounts`` int64 (n,), by steps, the last one
     for all that are later, all above 0; ``worths`` int64 (5,), of an unseen cell by the number of
-    known obstacles beside it; ``left``, the longest that a route may be; ``depth``, ``slack``,
-    ``firm``, ``rounds`` and ``orders`` are the constants of these names, the slack as a worth.
+    known obstacles beside it; ``target``, that of a known target; ``left``, the longest that a
+    route may be; ``depth``, ``slack``, ``firm``, ``rounds`` and ``orders`` are the constants of
+    these names, the slack as a worth.
     """
 
     offsets: np.ndarray
@@ -73,6 +74,7 @@ class Rules(NamedTuple):
     edge_counts: np.ndarray
     discounts: np.ndarray
     worths: np.ndarray
+    target: int
     left: int
     depth: int
     slack: int
@@ -106,6 +108,7 @@ def rules_at(timetable: Timetable, left: int) -> Rules:
         rules.edge_counts,
         timetable.discounts[row],
         timetable.worths[row],
+        rules.target,
         left,
         rules.depth,
         rules.slack,
@@ -153,12 +156,14 @@ class Labels(NamedTuple):
 class Routes(NamedTuple):
     """The routes of a team.
 
-    ``cells`` int32 (n_agents, n), ``lengths`` int64 (n_agents,), ``first`` uint8 (n_agents,), the
+    ``starts`` int64 (n_agents,), where the robots are, which is no part of a route; ``cells``
+    int32 (n_agents, n), ``lengths`` int64 (n_agents,), ``first`` uint8 (n_agents,), the
     actions that a route may begin with, as bits; ``worth`` int64 (n_agents, 5), by first action
     that of the best route found; ``begin`` int64 (n_agents,), steps until a route gets anything;
     ``robbed`` bool (n_agents,): a team mate's route gets what this one was to get before long.
     """
 
+    starts: np.ndarray
     cells: np.ndarray
     lengths: np.ndarray
     first: np.ndarray
@@ -213,6 +218,7 @@ def make_timetable(scene: Scene, stride: int) -> Timetable:
         edge_counts,
         discounts[-1],
         worths[-1],
+        TARGET_WORTH,
         scene.horizon,
         DEPTH,
         int(SLACK * TARGET_WORTH),
@@ -253,6 +259,7 @@ def make_labels(area: int) -> Labels:
 def make_routes(n_agents: int, area: int) -> Routes:
     """Allocate the routes of a team; ``area`` padded cells."""
     return Routes(
+        np.zeros(n_agents, np.int64),
         np.zeros((n_agents, area), np.int32),
         np.zeros(n_agents, np.int64),
         np.zeros(n_agents, np.uint8),

@@ -48,8 +48,6 @@ def forget(marks: Marks) -> None:
 def search(
     cells: np.ndarray,
     start: int,
-    target: int,
-    sees: bool,
     respect: int,
     rules: Rules,
     marks: Marks,
@@ -60,8 +58,6 @@ def search(
     A route that comes to a cell with no more than another had there, at that time or before, is
     given up, and so is one that falls far behind the best. Nothing is gained twice in one cell.
 
-    :param target: worth of a target
-    :param sees: whether unseen cells are worth anything
     :param respect: 1 to count only what is gained over the claims, 0 to count all
     :return: number of labels, and the index of the best
     """
@@ -69,7 +65,7 @@ def search(
     best, slot, claims = labels.best, labels.slot, marks.claims
     sights, unseen, offsets = marks.sight, marks.unseen, rules.offsets
     edges, edge_counts, discounts = rules.edges, rules.edge_counts, rules.discounts
-    depth, slack, left = rules.depth, rules.slack, rules.left
+    target, depth, slack, left = rules.target, rules.depth, rules.slack, rules.left
     cell_of[0], value_of[0], parent_of[0], first_of[0] = start, 0, NONE, 0
     best[start], slot[start] = 0, 0
     low, high, top, top_value, t = 0, 1, 0, 0, 0
@@ -90,18 +86,17 @@ def search(
                 value = before
                 if cells[cell] & KNOWN_TARGET:
                     value += target * max(0, discount - respect * claims[cell])
-                if sees:
-                    sight = sights[cell]
-                    if sight < 0:
-                        sight = _look(cells, rules, cell, marks)
-                    if sight > 0:
-                        if value + sight * discount < best[cell]:
-                            continue
-                        for q in range(edge_counts[action]):
-                            seen = cell + edges[action, q]
-                            gain = discount - respect * claims[seen]
-                            if gain > 0:
-                                value += unseen[seen] * gain
+                sight = sights[cell]
+                if sight < 0:
+                    sight = _look(cells, rules, cell, marks)
+                if sight > 0:
+                    if value + sight * discount < best[cell]:
+                        continue
+                    for q in range(edge_counts[action]):
+                        seen = cell + edges[action, q]
+                        gain = discount - respect * claims[seen]
+                        if gain > 0:
+                            value += unseen[seen] * gain
                 if value < best[cell]:
                     continue
                 here = slot[cell]

@@ -146,7 +146,6 @@ class TeamSlice:
                 look_ahead_data.make_marks(area),
                 look_ahead_data.make_labels(area),
                 look_ahead_data.make_routes(arrays.n_agents, area),
-                np.zeros(arrays.n_agents, np.int64),  # starts
                 paths.discount_table(),
                 out,
             )

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from area_search.look_ahead import place, plan_routes
+from area_search.look_ahead import plan_routes
 from area_search.look_ahead_data import (
-    TARGET_WORTH,
     Labels,
     Marks,
     Routes,
@@ -25,9 +24,7 @@ from area_search.look_ahead_data import (
     make_marks,
     make_routes,
     make_timetable,
-    rules_at,
 )
-from area_search.look_ahead_search import forget
 from sb3_roles.baselines.greedy import Walker, first_move, random_bits
 
 
@@ -45,7 +42,6 @@ class LookAheadController(Walker):
             make_marks(area),
             make_labels(area),
             make_routes(n, area),
-            np.zeros(n, np.int64),  # starts
             np.zeros((n_teams, n), np.int64),  # heading
         )
 
@@ -65,7 +61,6 @@ def _walk_routes(
     marks: Marks,
     labels: Labels,
     routes: Routes,
-    starts: np.ndarray,
     heading: np.ndarray,
     actions: np.ndarray,
 ) -> None:
@@ -75,11 +70,7 @@ def _walk_routes(
     """
     n_agents = position.shape[1]
     for m in range(position.shape[0]):
-        flat = cells[m].reshape(-1)
-        place(cells.shape[2], border, position[m], starts)
-        rules = rules_at(timetable, timetable.rules.left - steps[m])
-        plan_routes(flat, starts, TARGET_WORTH, True, rules, marks, labels, routes)
-        forget(marks)
+        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, routes)
         for i in range(n_agents):
             action = 0
             if routes.lengths[i] > 0:
