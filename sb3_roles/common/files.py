@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import os
 import secrets
+import stat
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 # Files are written in milliseconds; a partial one of that age has lost its writer.
 _STALE_SECONDS = 600.0
@@ -35,6 +37,22 @@ def write_atomically(path: Path, content: bytes) -> None:
             # A full disk is not said to be that of any file.
             error.filename = str(path)
         raise
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a file to read, if it is one: no pipe that waits for a writer, no device without end.
+
+    :param path: the file, or a link to one
+    :raises OSError: if it is something else, or can not be opened
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    # The flag, where the system has it, for what is put in its place in between.
+    file = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return file
 
 
 def remove_stale(folder: Path, below: bool = False) -> None:
