@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import io
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -18,8 +20,20 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
-from sb3_roles.common.files import csv_bytes, write_atomically
+from sb3_roles.common.files import csv_bytes, open_regular, write_atomically
 from sb3_roles.common.team_wrapper import find_team_env
+
+# A log may come with a run folder of anybody.
+_MAX_LINE, _MAX_LOG = 1 << 20, 256 << 20
+
+
+def _short_lines(file: TextIO) -> Iterator[str]:
+    size = 0
+    while line := file.readline(_MAX_LINE):
+        size += len(line)
+        if len(line) == _MAX_LINE or size > _MAX_LOG:
+            raise csv.Error(f"a line of {_MAX_LINE} characters, or {_MAX_LOG} in all")
+        yield line
 
 
 class CsvLog(KVWriter):
@@ -73,9 +87,10 @@ class CsvLog(KVWriter):
         """
         rows: list[list[str]] = []
         if self.path.exists():
+            n_rows = int(state["rows"])
             try:
-                with open(self.path, encoding="utf-8", newline="") as file:
-                    rows = list(csv.reader(file))
+                with io.TextIOWrapper(open_regular(self.path), "utf-8", newline="") as file:
+                    rows = list(islice(csv.reader(_short_lines(file)), 1 + n_rows))
             except (UnicodeDecodeError, csv.Error) as error:
                 raise CheckpointError(f"{self.path}: damaged log: {error}") from error
         self.columns = [str(name) for name in state["columns"]]
@@ -155,7 +170,8 @@ def train(
     callback.on_training_start({"total_timesteps": total, "self": model}, {})
     if resume is not None:
         snapshot.restore_stateful(stateful, resume)
-        snapshot.set_rng_state(resume.state["rng"])
+        with snapshot.fitting():
+            snapshot.set_rng_state(resume.state["rng"])
     if begin is not None:
         begin()
     per_iteration = model.n_steps * env.num_envs
