@@ -36,6 +36,7 @@ ALLOWED: Mapping[tuple[str, str], str] = MappingProxyType(
             "sb3_roles/common/env_declarations.py",
             "cloudpickle",
         ): "pickles an environment to see whether its copies work; loads nothing",
+        ("sb3_roles/prove/hostile_files.py", "pickle"): "makes the payloads of R6; loads nothing",
     }
 )
 """File and what is found there -> why it may be."""

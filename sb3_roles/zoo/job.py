@@ -190,6 +190,8 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
                 )
         except CheckpointError as error:
             raise UsageError(f"{run}: {error}") from error
+        except UsageError:
+            raise
         except (FloatingPointError, ValueError) as error:
             # Losses, rewards and observations that are not finite, teams that fall apart.
             if options["verbose"] > 1:

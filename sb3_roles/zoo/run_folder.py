@@ -141,11 +141,11 @@ def note_command(run: Path, command: Sequence[str]) -> None:
     :param run: the run folder
     :param command: the command line
     """
-    commit = source_commit(Path(__file__)) or "null"
-    lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
-    lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
-    lines.append(f"# {process_settings()}")
     with _open_itself(run / COMMAND_FILE) as file:
+        commit = source_commit(Path(__file__)) or "null"
+        lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
+        lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
+        lines.append(f"# {process_settings()}")
         file.write("\n".join(lines) + "\n")
 
 
