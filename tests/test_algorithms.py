@@ -265,7 +265,7 @@ def test_a_saved_model_acts_as_before_and_can_learn_on(kind, tmp_path):
     model = make_model(kind, kl_coef=0.5, policy={"norm_layer": "frozen_batch"})
     model.learn(2 * 10 * model.n_envs)
     model.save(tmp_path / "model")
-    loaded = type(model).load(tmp_path / "model", device="cpu")
+    loaded = type(model).load(tmp_path / "model", device="cpu", trust=True)
     assert same(weights(model), weights(loaded))
     assert loaded.kl_coefs == model.kl_coefs
     assert loaded.kl_coefs[0] != 0.5
@@ -277,7 +277,7 @@ def test_a_saved_model_acts_as_before_and_can_learn_on(kind, tmp_path):
             actions.append(one.predict(observations, deterministic=deterministic)[0])
         np.testing.assert_array_equal(*actions)
     bare = small_search(roles={} if kind == "hmappo" else None)
-    learner = type(model).load(tmp_path / "model", env=bare, device="cpu")
+    learner = type(model).load(tmp_path / "model", env=bare, device="cpu", trust=True)
     learner.learn(10 * model.n_envs)
     assert not same(weights(model), weights(learner))
 
@@ -287,7 +287,7 @@ def test_one_saved_policy_acts_for_1_to_50_robots(kind, tmp_path):
     model = make_model(kind)
     model.learn(10 * model.n_envs)
     model.save(tmp_path / "model")
-    loaded = type(model).load(tmp_path / "model", device="cpu")
+    loaded = type(model).load(tmp_path / "model", device="cpu", trust=True)
     wrapper = RoleWrapper if kind == "hmappo" else TeamWrapper
     for n_agents in (1, 2, 3, 13, 50):
         env = wrapper(small_search(n_teams=2, n_agents=n_agents))

@@ -15,7 +15,8 @@ import torch as th
 from stable_baselines3.common.logger import Logger
 from toy_envs import PlainEnv, WitnessEnv
 
-from sb3_roles.common import checkpoint as ckpt
+from sb3_roles.common import checkpoint, stored_zip
+from sb3_roles.common import checkpoint_reading as ckpt
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import (
     CheckpointError,
@@ -277,7 +278,12 @@ def test_a_failed_write_leaves_the_earlier_file(tmp_path, content, monkeypatch, 
         raise OSError(28, "No space left on device")
 
     if broken == "write":
-        monkeypatch.setattr(zipfile.ZipFile, "writestr", fail)
+
+        def pack(members):
+            yield b"PK"
+            fail()
+
+        monkeypatch.setattr(checkpoint, "pack", pack)
     else:
         monkeypatch.setattr(os, broken, fail)
     for step in (1, 2):
@@ -314,19 +320,11 @@ def test_damaged_files_are_refused(tmp_path, content):
         flipped = bytearray(sound)
         flipped[position] ^= 1 << int(rng.integers(8))
         damaged.append(bytes(flipped))
-    refused = 0
     for data in damaged:
         newest.write_bytes(data)
-        try:
-            read = read_checkpoint(newest)
-        except CheckpointError as error:
-            assert "\n" not in str(error)
-            refused += 1
-        else:
-            # A bit that means nothing, such as a date: what was read is what was written.
-            assert_same(read.policy, read_checkpoint(folder.paths()[0]).policy)
-            assert read.state["big"] == 2**100
-    assert refused > 150
+        with pytest.raises(CheckpointError) as caught:
+            read_checkpoint(newest)
+        assert "\n" not in str(caught.value)
     newest.write_bytes(sound[:100])
     with pytest.warns(UserWarning, match=r"going back to step_000000000001\.ckpt") as caught:
         path, _ = folder.newest()
@@ -336,16 +334,21 @@ def test_damaged_files_are_refused(tmp_path, content):
 
 def rewrite(path, change):
     """Pack the members again after a change, with a manifest that fits."""
+    # It need not vouch for itself: those of earlier releases do not.
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     manifest = json.loads(members.pop("manifest.json"))
+    del manifest["sha256"]
     compression = change(manifest, members) or zipfile.ZIP_STORED
     manifest["members"] = {
         name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
         for name, data in members.items()
     }
+    members = {"manifest.json": json.dumps(manifest).encode(), **members}
+    if compression == zipfile.ZIP_STORED:
+        path.write_bytes(b"".join(stored_zip.pack(members)))
+        return
     with zipfile.ZipFile(path, "w", compression) as archive:
-        archive.writestr("manifest.json", json.dumps(manifest))
         for name, data in members.items():
             archive.writestr(name, data)
 

@@ -202,7 +202,7 @@ def test_sb3_s_zip_restores_a_cloned_policy(demonstrations, tmp_path):
     model = cloner(demonstrations)
     model.learn(epochs(model, 1))
     model.save(tmp_path / "model")
-    loaded = GNN.load(tmp_path / "model")
+    loaded = GNN.load(tmp_path / "model", trust=True)
     assert same(weights(loaded), weights(model))
     obs = {key: value.numpy() for key, value in observation(played(2)).items()}
     first = model.predict(obs, deterministic=True)[0]

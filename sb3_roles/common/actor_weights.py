@@ -6,8 +6,9 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError
+from sb3_roles.common.checkpoint_fit import check_weights
+from sb3_roles.common.checkpoint_reading import Outline
 from sb3_roles.common.policies import TeamPolicy
-from sb3_roles.common.snapshot import check_weights
 
 HOLDS, ACTORS = "holds", "actors"
 """Key of a checkpoint's manifest, and its value in a file without critics."""
@@ -54,10 +55,27 @@ def load_actors(policy: BasePolicy, checkpoint: Checkpoint) -> None:
         policy's own type
     :raises CheckpointError: if a name, shape or dtype is another one; nothing is changed then
     """
-    own = actor_weights(policy)
+    given = _check(actor_weights(policy), checkpoint)
+    policy.load_state_dict({**policy.state_dict(), **given})
+
+
+def check_policy(policy: BasePolicy, found: Checkpoint | Outline) -> None:
+    """Refuse weights that are not those of a policy, or of its actors where there are only those.
+
+    :param policy: built from the configuration; may be without memory
+    :param found: what a file holds, or declares
+    :raises CheckpointError: if a name, shape or dtype is another one
+    """
+    if found.manifest.get(HOLDS) == ACTORS:
+        _check(actor_weights(policy), found)
+    else:
+        check_weights(found.policy, policy.state_dict())
+
+
+def _check(own: dict[str, th.Tensor], found: Checkpoint | Outline) -> dict[str, th.Tensor]:
     given = {
         name: tensor.float() if tensor.dtype == th.float16 else tensor
-        for name, tensor in checkpoint.policy.items()
+        for name, tensor in found.policy.items()
     }
     check_weights(given, own, owner="actors of the configuration")
-    policy.load_state_dict({**policy.state_dict(), **given})
+    return given

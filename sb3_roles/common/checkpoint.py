@@ -2,109 +2,50 @@
 
 A checkpoint is an uncompressed zip of a ``manifest.json`` (format version, and size and sha256 of
 every other member), tensors as safetensors, and a tree of plain values as JSON. Nothing in it is
-ever unpickled, evaluated or decompressed, and no size is trusted before it is checked.
+ever unpickled, evaluated or decompressed, no size is trusted before it is checked, and there is no
+byte that could change unnoticed.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import re
 import warnings
-import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import safetensors
 import safetensors.numpy
 import safetensors.torch
 import torch as th
 
+from sb3_roles.common.checkpoint_reading import (
+    ARRAYS,
+    FORMAT,
+    FORMAT_VERSION,
+    MANIFEST,
+    OPTIMIZER,
+    POLICY,
+    STATE,
+    SUM,
+    Check,
+    open_checkpoint,
+    read_manifest,
+    sum_of,
+    verify,
+)
+from sb3_roles.common.checkpoint_reading import Checkpoint as Checkpoint
+from sb3_roles.common.checkpoint_reading import CheckpointError as CheckpointError
+from sb3_roles.common.checkpoint_reading import read_checkpoint as read_checkpoint
 from sb3_roles.common.files import remove_partial, replace_file
-from sb3_roles.common.names import one_line
+from sb3_roles.common.plain_tree import encode_tree
+from sb3_roles.common.stored_zip import StoredZipError, pack
 
-FORMAT = "sb3_roles checkpoint"
-FORMAT_VERSION = 1
 SUFFIX = ".ckpt"
-MANIFEST, STATE = "manifest.json", "state.json"
-POLICY, OPTIMIZER, ARRAYS = "policy.safetensors", "optimizer.safetensors", "arrays.safetensors"
-_MEMBERS = (MANIFEST, STATE, POLICY, OPTIMIZER, ARRAYS)
-MAX_BYTES = 8 << 30
-_MAX_JSON = 64 << 20
 _NAME = re.compile(r"step_([0-9]{12})\.ckpt")
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-
-
-class CheckpointError(ValueError):
-    """A file that is no sound checkpoint, or does not fit; the message is a single line."""
-
-
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """What a checkpoint file holds.
-
-    :param manifest: facts about it, plain values
-    :param policy: weights and buffers of the policy
-    :param optimizer: its optimizer's tensors, ``<parameter's index>.<name>``
-    :param state: everything else, plain values and numpy arrays; empty in a file of weights only
-    """
-
-    manifest: dict[str, Any]
-    policy: dict[str, th.Tensor]
-    optimizer: dict[str, th.Tensor]
-    state: dict[str, Any]
-
-
-# The state: a tree of plain values and arrays, as JSON and safetensors
-
-
-def encode_tree(value: Any, arrays: dict[str, np.ndarray], where: str = "state") -> Any:
-    """Turn a tree into JSON values, and collect its arrays.
-
-    :param value: dicts with text keys, lists, tuples (which become lists), numbers, texts, None,
-        numpy scalars and numpy arrays of numbers
-    :param arrays: filled with the arrays, by their place
-    :param where: name of this place
-    :raises CheckpointError: naming the place of a value that can not be stored
-    """
-    if isinstance(value, np.ndarray):
-        if value.dtype.kind not in "biuf":
-            raise CheckpointError(f"{where} is an array of {value.dtype}, which can not be stored")
-        arrays[where] = np.ascontiguousarray(value).reshape(value.shape)
-        return {"__array__": where}
-    if isinstance(value, np.generic):
-        return value.item()
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    if isinstance(value, Mapping):
-        wrong = [key for key in value if not isinstance(key, str) or key == "__array__"]
-        if wrong:
-            raise CheckpointError(f"{where} has the key {wrong[0]!r}: keys must be texts")
-        return {key: encode_tree(item, arrays, f"{where}/{key}") for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [encode_tree(item, arrays, f"{where}/{i}") for i, item in enumerate(value)]
-    raise CheckpointError(f"{where} is a {type(value).__name__}, which can not be stored")
-
-
-def decode_tree(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Undo :func:`encode_tree`; tuples have become lists.
-
-    :param value: JSON values
-    :param arrays: by place
-    """
-    if isinstance(value, dict):
-        if "__array__" in value:
-            return arrays[value["__array__"]]
-        return {key: decode_tree(item, arrays) for key, item in value.items()}
-    if isinstance(value, list):
-        return [decode_tree(item, arrays) for item in value]
-    return value
-
-
-# One file
 
 
 def write_checkpoint(
@@ -120,12 +61,16 @@ def write_checkpoint(
     :param manifest: facts to keep, plain values
     :param policy: weights and buffers
     :param optimizer: its tensors
-    :param state: see :func:`encode_tree`
+    :param state: see :func:`~sb3_roles.common.plain_tree.encode_tree`
     :raises CheckpointError: if something can not be stored, or reads back differently
     :raises OSError: if the disk refuses; the earlier file is intact then
     """
     arrays: dict[str, np.ndarray] = {}
-    tree = encode_tree(dict(state or {}), arrays)
+    try:
+        tree = encode_tree(dict(state or {}), arrays)
+        facts = encode_tree(dict(manifest), {}, "manifest")
+    except ValueError as error:
+        raise CheckpointError(str(error)) from error
     members = {
         POLICY: safetensors.torch.save(_on_cpu(policy)),
         OPTIMIZER: safetensors.torch.save(_on_cpu(optimizer or {})),
@@ -135,25 +80,28 @@ def write_checkpoint(
     facts = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        **encode_tree(dict(manifest), {}, "manifest"),
+        **facts,
         "members": {
-            name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+            name: {"bytes": len(data), SUM: hashlib.sha256(data).hexdigest()}
             for name, data in members.items()
         },
     }
+    facts[SUM] = sum_of(facts)
     members = {MANIFEST: json.dumps(facts, indent=1).encode(), **members}
 
     def write(file: IO[bytes]) -> None:
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-            for name, data in members.items():
-                # A fixed date: equal states make equal files.
-                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+        file.writelines(pack(members))
 
-    def check(written: Path) -> None:
-        if _read(written)[1] != {name: members[name] for name in members if name != MANIFEST}:
-            raise CheckpointError(f"{path}: reads back differently from what was written")
+    def check(temporary: Path) -> None:
+        with open_checkpoint(temporary) as (written, found):
+            if read_manifest(path, written, found) != json.loads(members[MANIFEST]):
+                raise CheckpointError(f"{path}: reads back differently from what was written")
+            verify(path, written, found, facts)
 
-    replace_file(path, write, check)
+    try:
+        replace_file(path, write, check)
+    except StoredZipError as error:
+        raise CheckpointError(f"{path}: {error}") from error
 
 
 def _on_cpu(tensors: Mapping[str, th.Tensor]) -> dict[str, th.Tensor]:
@@ -161,73 +109,6 @@ def _on_cpu(tensors: Mapping[str, th.Tensor]) -> dict[str, th.Tensor]:
     return {
         name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()
     }
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Return the manifest and the members that it vouches for."""
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise CheckpointError(f"{path}: {size} bytes, more than the {MAX_BYTES} of any checkpoint")
-    with zipfile.ZipFile(path) as archive:
-        entries = archive.infolist()
-        if sorted(entry.filename for entry in entries) != sorted(_MEMBERS):
-            raise CheckpointError(f"{path}: its members are not those of a checkpoint")
-        for entry in entries:
-            stored = entry.compress_type == zipfile.ZIP_STORED
-            if not stored or entry.file_size != entry.compress_size or entry.file_size > size:
-                raise CheckpointError(f"{path}: {entry.filename} is not stored as it is")
-            if entry.filename.endswith(".json") and entry.file_size > _MAX_JSON:
-                raise CheckpointError(f"{path}: {entry.filename} has {entry.file_size} bytes")
-        data = {name: archive.read(name) for name in _MEMBERS}
-    manifest = json.loads(data.pop(MANIFEST))
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: no checkpoint of sb3_roles")
-    if manifest.get("format_version") != FORMAT_VERSION:
-        raise CheckpointError(
-            f"{path}: format version {manifest.get('format_version')!r}, this program reads "
-            f"{FORMAT_VERSION}"
-        )
-    expected = {
-        name: {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-        for name, content in data.items()
-    }
-    if manifest.get("members") != expected:
-        raise CheckpointError(f"{path}: a member is not what the manifest says")
-    return manifest, data
-
-
-def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint and verify it. No code of the file runs, whatever it holds.
-
-    :param path: the file
-    :raises CheckpointError: if it is damaged, or none
-    """
-    try:
-        manifest, members = _read(path)
-        arrays = safetensors.numpy.load(members[ARRAYS])
-        return Checkpoint(
-            manifest,
-            safetensors.torch.load(members[POLICY]),
-            safetensors.torch.load(members[OPTIMIZER]),
-            decode_tree(json.loads(members[STATE]), arrays),
-        )
-    except CheckpointError:
-        raise
-    except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror or error}") from error
-    except (
-        zipfile.BadZipFile,
-        safetensors.SafetensorError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-    ) as error:
-        message = one_line(error)
-        raise CheckpointError(f"{path}: damaged checkpoint: {message}") from error
 
 
 # A folder of them
@@ -247,7 +128,13 @@ class CheckpointFolder:
         self.folder, self.keep = folder, keep
 
     def prepare(self) -> None:
-        """Make the folder, and remove what killed writers left; for the owner of the run only."""
+        """Make the folder, and remove what killed writers left; for the owner of the run only.
+
+        :raises OSError: if it can not be made, or is a link: a run folder may come from anybody,
+            and must not choose where files are removed
+        """
+        if self.folder.is_symlink():
+            raise OSError(errno.ELOOP, "is a symbolic link, not a folder", str(self.folder))
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_partial(self.folder)
 
@@ -268,15 +155,19 @@ class CheckpointFolder:
             old.unlink(missing_ok=True)
         return path
 
-    def newest(self) -> tuple[Path, Checkpoint]:
+    def newest(
+        self, check: Check | None = None, weights_only: bool = False
+    ) -> tuple[Path, Checkpoint]:
         """Read the newest sound one; older ones are taken with a warning.
 
+        :param check: see :func:`read_checkpoint`
+        :param weights_only: see :func:`read_checkpoint`
         :raises CheckpointError: if there is none
         """
         reason = ""
         for path in reversed(self.paths()):
             try:
-                checkpoint = read_checkpoint(path)
+                checkpoint = read_checkpoint(path, check, weights_only)
             except CheckpointError as error:
                 reason = reason or str(error)
                 continue

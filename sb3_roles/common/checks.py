@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -50,3 +51,19 @@ def check_not_negative(**values: Any) -> None:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not 0.0 <= value < float("inf"):
             raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+
+
+def check_trusted(what: str, path: object, trust: bool) -> None:
+    """Refuse to unpickle a file that the caller does not vouch for.
+
+    :param what: what was called, for the message
+    :param path: the file
+    :param trust: whether the caller does
+    :raises ValueError: if not
+    """
+    if trust is not True:
+        where = path if isinstance(path, (str, os.PathLike)) else "the file"
+        raise ValueError(
+            f"{what} unpickles, and so runs whatever code {where} names: give trust=True if you "
+            "know who wrote it; run folders load without that: sb3_roles.zoo.models.load_model"
+        )

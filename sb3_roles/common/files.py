@@ -7,12 +7,13 @@ import errno
 import io
 import os
 import secrets
+import stat
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 # What a folder answers where the file system keeps no order between it and its files.
 _UNSYNCED = (errno.EINVAL, errno.ENOTSUP)
@@ -116,6 +117,22 @@ def remove_partial(folder: Path) -> None:
     """
     for path in folder.glob(f"*{_PARTIAL}"):
         path.unlink(missing_ok=True)
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a file to read, if it is one: no pipe that waits for a writer, no device without end.
+
+    :param path: the file, or a link to one
+    :raises OSError: if it is something else, or can not be opened
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    # The flag, where the system has it, for what is put in its place in between.
+    file = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return file
 
 
 def remove_stale(folder: Path, below: bool = False) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
 
+from sb3_roles.common.checks import check_trusted
 from sb3_roles.common.names import closest
 from sb3_roles.common.role_wrapper import ROLE_DUE_KEY, ROLE_KEY
 from sb3_roles.common.team_wrapper import AGENT_KEY
@@ -35,6 +36,7 @@ POSITION_KEY = "position"
 _STRUCTURE_KEYS = (AGENT_KEY, ROLE_KEY, ROLE_DUE_KEY, POSITION_KEY)
 
 Observation = Mapping[str, th.Tensor]
+SelfTeamPolicy = TypeVar("SelfTeamPolicy", bound="TeamPolicy")
 
 
 class Streams(NamedTuple):
@@ -179,6 +181,23 @@ class TeamPolicy(ActorCriticPolicy):
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
         )
+
+    @classmethod
+    def load(
+        cls: type[SelfTeamPolicy],
+        path: str,
+        device: th.device | str = "auto",
+        trust: bool = False,
+    ) -> SelfTeamPolicy:
+        """Load what SB3's ``save`` of a policy wrote.
+
+        :param path: the file
+        :param device: where the policy shall be
+        :param trust: must be true: the file is a pickle, which runs whatever code it names
+        :raises ValueError: if ``trust`` is not given
+        """
+        check_trusted(f"{cls.__name__}.load", path, trust)
+        return super().load(path, device)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {

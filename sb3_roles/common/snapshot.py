@@ -24,6 +24,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_roles._version import __version__
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError
+from sb3_roles.common.checkpoint_fit import (
+    check_like,
+    check_weights,
+    fitting,
+    parameter_of,
+    parameters_of,
+)
 from sb3_roles.common.env_state import env_state, laid_out_like, set_env_state
 from sb3_roles.common.team_wrapper import find_team_env
 
@@ -176,50 +183,17 @@ def load_weights(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
     model.policy.load_state_dict(checkpoint.policy)
 
 
-def check_weights(
-    given: Mapping[str, th.Tensor],
-    own: Mapping[str, th.Tensor],
-    what: str = "weights",
-    owner: str = "configuration",
-) -> None:
-    """Refuse weights that are not those of a policy, by name, shape and dtype.
-
-    :param given: of a file
-    :param own: of the policy
-    :param what: what the message calls the former
-    :param owner: what they should fit
-    :raises CheckpointError: if a name, shape or dtype is another one
-    """
-    odd = sorted(set(own) ^ set(given))
-    if odd:
-        raise CheckpointError(f"the {what} do not fit the {owner}: {odd[0]} is in one only")
-    for name, tensor in own.items():
-        _check_like(f"{what} {name}", given[name], tensor, owner)
-
-
-def _check_like(
-    what: str, given: th.Tensor, wanted: th.Tensor, owner: str = "configuration"
-) -> None:
-    if given.shape != wanted.shape or given.dtype != wanted.dtype:
-        raise CheckpointError(
-            f"the {what} do not fit the {owner}: {given.dtype} {tuple(given.shape)}, "
-            f"expected {wanted.dtype} {tuple(wanted.shape)}"
-        )
-
-
 def _load_optimizer(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
     optimizer = model.policy.optimizer
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    parameters = parameters_of(model)
     entries: dict[int, dict[str, th.Tensor]] = {}
     for key, tensor in checkpoint.optimizer.items():
         index, _, name = key.partition(".")
-        if not index.isdigit() or int(index) >= len(parameters):
-            raise CheckpointError(f"the optimizer does not fit the configuration: {key}")
-        parameter = parameters[int(index)]
+        parameter = parameter_of(key, parameters)
         if tensor.ndim == 0:
             entries.setdefault(int(index), {})[name] = tensor
             continue
-        _check_like(f"optimizer's {key}", tensor, parameter)
+        check_like(f"optimizer's {key}", tensor, parameter)
         # Laid out like the parameter, as the optimizer itself would: fused kernels rely on it.
         like = th.empty_like(parameter, requires_grad=False)
         entries.setdefault(int(index), {})[name] = like.copy_(tensor)
@@ -236,7 +210,7 @@ def restore(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
     """
     assert model.env is not None
     state = checkpoint.state
-    try:
+    with fitting():
         load_weights(model, checkpoint)
         _load_optimizer(model, checkpoint)
         for group, rate in zip(
@@ -244,7 +218,10 @@ def restore(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
         ):
             group["lr"] = rate
         for name in _COUNTERS:
-            setattr(model, name, state["counters"][name])
+            value = state["counters"][name]
+            if type(value) not in (int, float) or not 0 <= value < 2**53:
+                raise CheckpointError(f"damaged checkpoint: {name} is {str(value)[:40]}")
+            setattr(model, name, value)
         model.start_time = time.time_ns() - int(state["elapsed_ns"])
         if state["kl_coefs"]:
             model.kl_coefs = [float(one) for one in state["kl_coefs"]]  # type: ignore[attr-defined]
@@ -263,10 +240,6 @@ def restore(model: OnPolicyAlgorithm, checkpoint: Checkpoint) -> None:
             model.logger.name_to_value[key] = value
             model.logger.name_to_count[key] = logger["counts"][key]
             model.logger.name_to_excluded[key] = tuple(logger["excluded"][key])
-    except (KeyError, TypeError, IndexError, AttributeError, ValueError) as error:
-        if isinstance(error, CheckpointError):
-            raise
-        raise CheckpointError(f"the checkpoint does not fit the configuration: {error}") from error
 
 
 def _set_observations(model: OnPolicyAlgorithm, state: Mapping[str, Any]) -> None:
@@ -291,7 +264,7 @@ def _set_lstm(model: Any, saved: Sequence[Sequence[np.ndarray]]) -> None:
     for pair, old in zip(saved, fresh, strict=True):
         tensors = [th.from_numpy(np.array(one)).to(model.device) for one in pair]
         for given, wanted in zip(tensors, old, strict=True):
-            _check_like("LSTM states", given, wanted)
+            check_like("LSTM states", given, wanted)
         pairs.append(tuple(tensors))
     model._last_lstm_states = type(fresh)(*pairs)
 
@@ -303,9 +276,11 @@ def restore_stateful(stateful: Sequence[Any], checkpoint: Checkpoint) -> None:
     :param checkpoint: read from a file
     :raises CheckpointError: if these are others
     """
-    saved = checkpoint.state["stateful"]
     names = [type(one).__name__ for one in stateful]
-    if [name for name, _ in saved] != names:
-        raise CheckpointError(f"the run had the callbacks {[n for n, _ in saved]}, now {names}")
-    for one, (_, state) in zip(stateful, saved, strict=True):
-        one.set_state(state)
+    with fitting():
+        saved = checkpoint.state["stateful"]
+        if [name for name, _ in saved] != names:
+            had = str([name for name, _ in saved])[:200]
+            raise CheckpointError(f"the run had the callbacks {had}, now {names}")
+        for one, (_, state) in zip(stateful, saved, strict=True):
+            one.set_state(state)

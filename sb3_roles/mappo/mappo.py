@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,7 +18,7 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_roles.common.buffers import TeamRolloutBuffer
-from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
+from sb3_roles.common.checks import check_not_negative, check_positive, check_trusted, check_unit
 from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
 from sb3_roles.common.policies import TeamPolicy
 from sb3_roles.common.rollout_steps import LocalPlayer, RolloutPlayer
@@ -171,6 +173,27 @@ class MAPPO(OnPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "player"]
+
+    @classmethod
+    def load(
+        cls: type[SelfMAPPO],
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        *args: Any,
+        trust: bool = False,
+        **kwargs: Any,
+    ) -> SelfMAPPO:
+        """Load what SB3's ``save`` wrote; see ``BaseAlgorithm.load``.
+
+        :param path: the zip
+        :param env: to train on
+        :param args: see ``BaseAlgorithm.load``
+        :param trust: must be true: the zip holds pickles, which run whatever code they name
+        :param kwargs: see ``BaseAlgorithm.load``
+        :raises ValueError: if ``trust`` is not given
+        """
+        check_trusted(f"{cls.__name__}.load", path, trust)
+        return super().load(path, env, *args, **kwargs)
 
     @classmethod
     def _wrap_env(cls, env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:

@@ -92,7 +92,7 @@ PROMISES = {
         Promise("R5", "corrupted checkpoints are refused with one line, wrong weights never load",
             "1000/1000", "corruption:damaged"),
         Promise("R6", "hostile checkpoints: no code runs, memory stays bounded, exit code 2",
-            "all of at least 12 kinds", "corruption:hostile"),
+            "all of at least 12 kinds", "hostile:hostile"),
         Promise("R7", "no pickle, eval or unsafe YAML on any load path of the source", "0 hits",
             "source_gate:hits"),
         Promise("R8", "malformed configurations and command lines: exit code 2, one line that "

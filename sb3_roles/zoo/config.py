@@ -10,8 +10,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from sb3_roles.common.files import write_atomically
+from sb3_roles.common.files import open_regular, write_atomically
 from sb3_roles.common.names import closest
+from sb3_roles.common.safe_yaml import parse_yaml
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config_checks import (
     IDENTITY,
@@ -54,9 +55,11 @@ def read_yaml(path: Path) -> Any:
     import yaml
 
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        with open_regular(path) as file:
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
             raise ConfigError([f"{path}: larger than {_MAX_BYTES} bytes, this is no configuration"])
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return parse_yaml(content.decode())
     except OSError as error:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from sb3_roles.common import snapshot
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+from sb3_roles.common.checkpoint_fit import check_outline
 from sb3_roles.common.env_state import env_gap
 from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
@@ -38,9 +40,9 @@ from sb3_roles.evaluation.evaluators import (
 )
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
-from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scenes_of_run
+from sb3_roles.zoo.environments import AREA_SEARCH, ENVIRONMENTS, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
-from sb3_roles.zoo.models import check_device, complete, make_env, make_model, steps_of
+from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model, steps_of
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ray_options import rollouts_on_ray
 from sb3_roles.zoo.run_folder import (
@@ -87,6 +89,8 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
     # Before the folder is made: a wrong environment must leave nothing behind.
     env = make_env(config)
     try:
+        if job["resume"] is not None:
+            check_run(config, env, Path(job["resume"]))
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
@@ -204,6 +208,8 @@ def _train_in(
             )
         except CheckpointError as error:
             raise UsageError(f"{run}: {error}") from error
+        except UsageError:
+            raise
         except (FloatingPointError, ValueError) as error:
             # Losses, rewards and observations that are not finite, teams that fall apart.
             if options["verbose"] > 1:
@@ -259,7 +265,10 @@ def _read_newest(
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            _, checkpoint = checkpoints.newest()
+            own = config["env"] not in ENVIRONMENTS
+            # The state of anybody's own environment, whose code the user named, may have any size.
+            check = None if own else partial(check_outline, model)
+            _, checkpoint = checkpoints.newest(check)
         begun = steps_of(checkpoint, "env_steps")
     except CheckpointError as error:
         raise UsageError(str(error)) from error

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_roles.common.durations import long_duration
+from sb3_roles.common.files import open_regular
+from sb3_roles.common.safe_yaml import parse_yaml
 from sb3_roles.zoo.options import UsageError
 
 CARD = "README.md"
@@ -49,6 +51,9 @@ _FACTS: dict[str, type | tuple[type, ...]] = {
 }
 
 
+_MAX_BYTES = 1 << 20
+
+
 class CardError(UsageError):
     """A card that can not be read, or files that are not what it says; one line."""
 
@@ -77,8 +82,10 @@ def read_card(folder: Path) -> dict[str, Any]:
 
     path = folder / CARD
     try:
-        before, head, _ = path.read_text(encoding="utf-8").split(_FENCE, 2)
-        facts = yaml.safe_load(head)
+        with open_regular(path) as file:
+            text = file.read(_MAX_BYTES).decode()
+        before, head, _ = text.split(_FENCE, 2)
+        facts = parse_yaml(head)
     except OSError as error:
         raise CardError(f"{path}: {error.strerror or error}") from None
     except (yaml.YAMLError, ValueError, RecursionError):
@@ -93,8 +100,12 @@ def read_card(folder: Path) -> dict[str, Any]:
 
 def facts_of_file(path: Path) -> dict[str, Any]:
     """Return what a card says of a file: ``bytes`` and ``sha256``."""
-    content = path.read_bytes()
-    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    digest, size = hashlib.sha256(), 0
+    with open_regular(path) as file:
+        while content := file.read(1 << 20):
+            digest.update(content)
+            size += len(content)
+    return {"bytes": size, "sha256": digest.hexdigest()}
 
 
 def check_files(folder: Path, facts: Mapping[str, Any]) -> None:
@@ -105,7 +116,9 @@ def check_files(folder: Path, facts: Mapping[str, Any]) -> None:
     :raises CardError: naming a file that is missing, or another one
     """
     for name, wanted in facts["files"].items():
-        path = folder / name
+        path = folder / str(name)
+        if Path(str(name)).is_absolute() or ".." in Path(str(name)).parts:
+            raise CardError(f"{folder / CARD}: damaged: {path} is not in its folder")
         try:
             found = facts_of_file(path)
         except OSError as error:

@@ -10,15 +10,17 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_roles.common.actor_weights import ACTORS, HOLDS, load_actors
+from sb3_roles.common.actor_weights import ACTORS, HOLDS, check_policy, load_actors
 from sb3_roles.common.checkpoint import (
     Checkpoint,
     CheckpointError,
     CheckpointFolder,
     read_checkpoint,
 )
+from sb3_roles.common.checkpoint_reading import Outline, read_outline
 from sb3_roles.common.role_wrapper import RoleWrapper
 from sb3_roles.common.snapshot import load_weights
 from sb3_roles.common.team_vec_env import make_team_vec_env
@@ -112,6 +114,40 @@ def make_model(
     except (TypeError, ValueError, RuntimeError) as error:
         raise UsageError(f"{config['algo']}: {error}") from error
     return model
+
+
+def policy_outline(config: Mapping[str, Any], env: VecEnv) -> BasePolicy:
+    """Return the policy of a configuration without memory for its weights.
+
+    What they are can be compared with a file before either takes memory, however large a
+    configuration, which may come from anybody, wants them.
+
+    :param config: checked, see ``zoo.config``
+    :param env: of :func:`make_env`
+    :return: its tensors are of the device "meta"
+    :raises UsageError: if the configuration and the environment do not fit
+    """
+    with th.device("meta"):
+        return make_model(config, env, "meta").policy
+
+
+def check_run(config: Mapping[str, Any], env: VecEnv, folder: Path) -> None:
+    """Refuse to build a model for a run whose checkpoints are not of its policy.
+
+    :param config: of the run, checked
+    :param env: of :func:`make_env`
+    :param folder: of the run
+    :raises UsageError: saying why the newest one does not fit, if none does
+    """
+    reason = None
+    outline = policy_outline(small_config(config, 1), env)
+    for path in reversed(CheckpointFolder(folder / CHECKPOINTS).paths()):
+        try:
+            check_policy(outline, read_outline(path))
+            return
+        except CheckpointError as error:
+            reason = reason or error
+    raise UsageError(f"{folder}: {reason or 'no checkpoint'}")
 
 
 def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
@@ -209,13 +245,21 @@ def load_model(
     check_named(folder, config["env"], env)
     small = small_config(config, 1)
     try:
-        if best:
-            checkpoint = read_checkpoint(folder / BEST / WEIGHTS_FILE)
-        else:
-            _, checkpoint = CheckpointFolder(folder / CHECKPOINTS).newest()
         with warnings.catch_warnings(), th.random.fork_rng(devices=[]):
             warnings.filterwarnings("ignore", category=UserWarning, module="stable_baselines3")
-            model = make_model(small, make_env(small), device)
+            env_of_one = make_env(small)
+            outline = policy_outline(small, env_of_one)
+
+        def check(found: Outline) -> None:
+            check_policy(outline, found)
+
+        if best:
+            checkpoint = read_checkpoint(folder / BEST / WEIGHTS_FILE, check, weights_only=True)
+        else:
+            _, checkpoint = CheckpointFolder(folder / CHECKPOINTS).newest(check, weights_only=True)
+        with warnings.catch_warnings(), th.random.fork_rng(devices=[]):
+            warnings.filterwarnings("ignore", category=UserWarning, module="stable_baselines3")
+            model = make_model(small, env_of_one, device)
         if checkpoint.manifest.get(HOLDS) == ACTORS:
             load_actors(model.policy, checkpoint)
         else:

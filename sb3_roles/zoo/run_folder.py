@@ -72,15 +72,20 @@ def new_run(logs: Path, algo: str, env: str) -> Path:
             number += 1
 
 
+def _refuse_link(path: Path) -> None:
+    if path.is_symlink():
+        raise UsageError(f"{path}: is a symbolic link, where a run has a file: remove it")
+
+
 def _open_itself(path: Path) -> IO[str]:
     """Open a file to read and append, and never the one that a link stands for.
 
-    A run folder may come from anybody, and a lock is emptied before its owner is written into it.
+    A run folder may come from anybody, and must not choose what else is written to: a lock is
+    emptied before its owner is written into it, a command line is added to those before it.
 
     :raises UsageError: if the file is a link, or can not be opened
     """
-    if path.is_symlink():
-        raise UsageError(f"{path}: is a symbolic link, where a lock must be a file: remove it")
+    _refuse_link(path)
     # The flag, where the system has it, for a link that is made in between.
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0)
     try:
@@ -146,6 +151,7 @@ def note_command(run: Path, command: Sequence[str]) -> None:
     lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
     lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
     lines.append(f"# {process_settings()}")
+    _refuse_link(run / COMMAND_FILE)
     append(run / COMMAND_FILE, ("\n".join(lines) + "\n").encode())
 
 

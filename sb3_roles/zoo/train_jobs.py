@@ -67,6 +67,7 @@ _FREE = (
     "save_freq",
     "ray",
     "rollout_workers",
+    "tensorboard_log",
 )
 _STORED = ("eval_freq", "eval_episodes", "save_freq", "log_interval", "tensorboard_log")
 _STORED_RANGES: dict[str, tuple[int, int]] = {
@@ -154,6 +155,13 @@ def _new_job(given: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, 
     return {"config": config, "options": options, "resume": None}
 
 
+def _is_here(folder: str) -> bool:
+    try:
+        return Path(folder).resolve().is_relative_to(Path.cwd().resolve())
+    except (OSError, ValueError, RuntimeError):
+        return False
+
+
 def resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
     """Make the job that continues a run.
 
@@ -187,6 +195,14 @@ def resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
     folder = options["tensorboard_log"]
     if folder is not None and not isinstance(folder, str):
         raise ConfigError([f"{path / ARGS_FILE}: tensorboard_log must be a text, got {folder!r}"])
+    if folder is not None and "tensorboard_log" not in given and not _is_here(folder):
+        # A run folder may come from anybody, and must not choose where files are written.
+        raise ConfigError(
+            [
+                f"{path / ARGS_FILE}: tensorboard_log is {folder}, outside of the current folder: "
+                f"add --tensorboard-log {folder} if you want that"
+            ]
+        )
     if "n_timesteps" in given:
         config["n_timesteps"] = given["n_timesteps"]
     return {"config": config, "options": options, "resume": path}

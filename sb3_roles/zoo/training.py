@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -14,11 +16,23 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
-from sb3_roles.common.files import append, csv_bytes, write_atomically
+from sb3_roles.common.files import append, csv_bytes, open_regular, write_atomically
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.zoo.stop_signals import StopSignals
 
 _STOPPING = "stopping, this iteration will be repeated by --resume; again to stop at once"
+
+# A log may come with a run folder of anybody.
+_MAX_LINE, _MAX_LOG = 1 << 20, 256 << 20
+
+
+def _short_lines(file: TextIO) -> Iterator[str]:
+    size = 0
+    while line := file.readline(_MAX_LINE):
+        size += len(line)
+        if len(line) == _MAX_LINE or size > _MAX_LOG:
+            raise csv.Error(f"a line of {_MAX_LINE} characters, or {_MAX_LOG} in all")
+        yield line
 
 
 class CsvLog(KVWriter):
@@ -71,9 +85,10 @@ class CsvLog(KVWriter):
         """
         rows: list[list[str]] = []
         if self.path.exists():
+            n_rows = int(state["rows"])
             try:
-                with open(self.path, encoding="utf-8", newline="") as file:
-                    rows = list(csv.reader(file))
+                with io.TextIOWrapper(open_regular(self.path), "utf-8", newline="") as file:
+                    rows = list(islice(csv.reader(_short_lines(file)), 1 + n_rows))
             except (UnicodeDecodeError, csv.Error) as error:
                 raise CheckpointError(f"{self.path}: damaged log: {error}") from error
         self.columns = [str(name) for name in state["columns"]]
@@ -148,7 +163,8 @@ def train(
     callback.on_training_start({"total_timesteps": total, "self": model}, {})
     if resume is not None:
         snapshot.restore_stateful(stateful, resume)
-        snapshot.set_rng_state(resume.state["rng"])
+        with snapshot.fitting():
+            snapshot.set_rng_state(resume.state["rng"])
     if begin is not None:
         begin()
     per_iteration = model.n_steps * env.num_envs
