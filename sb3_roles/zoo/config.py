@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_roles.common.files import write_atomically
-from sb3_roles.common.names import closest
+from sb3_roles.common.names import closest, printable, shown
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config_checks import (
     IDENTITY,
@@ -41,7 +41,7 @@ class ConfigError(UsageError):
     """
 
     def __init__(self, lines: Iterable[str]) -> None:
-        self.lines = tuple(" ".join(str(line).split()) for line in lines)
+        self.lines = tuple(printable(str(line)) for line in lines)
         super().__init__("; ".join(self.lines))
 
 
@@ -51,17 +51,23 @@ def read_yaml(path: Path) -> Any:
     :param path: the file
     :raises ConfigError: if it can not be read
     """
-    import yaml
+    from sb3_roles.common.yaml_text import YamlError, load_yaml
 
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ConfigError([f"{path}: larger than {_MAX_BYTES} bytes, this is no configuration"])
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        # Bounded: a device has no size, and no end.
+        with open(path, "rb") as file:
+            content = file.read(_MAX_BYTES + 1)
     except OSError as error:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
+    if len(content) > _MAX_BYTES:
+        raise ConfigError([f"{path}: larger than {_MAX_BYTES} bytes, this is no configuration"])
+    try:
+        return load_yaml(content.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            [f"{path}: not valid YAML: must be text in UTF-8, byte {error.start} is not"]
+        ) from None
+    except YamlError as error:
         raise ConfigError([f"{path}: not valid YAML: {error}"]) from None
 
 
@@ -107,7 +113,7 @@ def load_settings(algo: str, env: str, file: Path | None = None) -> dict[str, An
         message = closest("environment", env, [*map(str, content), DEFAULT])
         raise ConfigError([f"{path}: {message}"])
     if not isinstance(settings, dict):
-        raise ConfigError([f"{path}: {env} must be keys and values, got {settings!r}"])
+        raise ConfigError([f"{path}: {env} must be keys and values, got {shown(settings)}"])
     return settings
 
 
@@ -132,7 +138,8 @@ def load_identity(file: Path) -> dict[str, Any]:
 def _read_mapping(path: Path) -> dict[Any, Any]:
     content = read_yaml(path)
     if not isinstance(content, dict):
-        raise ConfigError([f"{path}: must be keys and values, got {type(content).__name__}"])
+        got = "nothing" if content is None else type(content).__name__
+        raise ConfigError([f"{path}: must be keys and values, got {got}"])
     return content
 
 

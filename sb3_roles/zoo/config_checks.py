@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sb3_roles.common.names import closest
+from sb3_roles.common.names import closest, shown
 from sb3_roles.common.roles import ROLES, role_controls
 from sb3_roles.zoo.algorithms import ALGORITHMS, POLICY_ARGUMENTS, Algorithm
 from sb3_roles.zoo.environments import (
@@ -44,7 +44,7 @@ def config_problems(config: Mapping[str, Any]) -> list[str]:
         return [closest("algorithm", algo, ALGORITHMS)]
     algorithm = ALGORITHMS[algo]
     if not isinstance(env, str):
-        return [f"env must be a name or module:factory, got {env!r}"]
+        return [f"env must be a name or module:factory, got {shown(env)}"]
     top: dict[str, Range] = {
         **_RUN,
         "policy": Choice(tuple(algorithm.policies)),
@@ -58,7 +58,7 @@ def config_problems(config: Mapping[str, Any]) -> list[str]:
     found += problems("", flat, {**top, **dict.fromkeys(NESTED, Weights())})
     for key, value in nested.items():
         if not isinstance(value, Mapping):
-            found.append(f"{key} must be keys and values, got {value!r}")
+            found.append(f"{key} must be keys and values, got {shown(value)}")
     if isinstance(config.get("env_kwargs"), Mapping):
         found += env_problems(env, config["env_kwargs"])
     if isinstance(config.get("wrapper_kwargs"), Mapping):
@@ -95,7 +95,7 @@ def _wrapper_problems(algorithm: Algorithm, env: str, options: Mapping[str, Any]
             if options.get(key, only) != only:
                 found.append(
                     f"wrapper_kwargs.{key} must be {only} for {algorithm.name}, whose policy "
-                    f"chooses a role at every step, got {options[key]!r}"
+                    f"chooses a role at every step, got {shown(options[key])}"
                 )
     if env == AREA_SEARCH and not found:
         found += _component_problems(options)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from area_search.scenes import Scene, SceneError, get_scene, unknown
+from sb3_roles.common.names import printable, shown
 
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction["Parser"]
@@ -48,7 +49,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit."""
-        self.exit(2, f"{self.prog}: error: {' '.join(message.split())}\n")
+        self.exit(2, f"{self.prog}: error: {printable(message)}\n")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse, and refuse what is not known here: later it would be the top parser's error."""
@@ -118,7 +119,7 @@ def whole_number(low: int, high: int) -> Callable[[str], int]:
         value = int(text) if _INTEGER.fullmatch(text) else None
         if value is None or not low <= value <= high:
             raise argparse.ArgumentTypeError(
-                f"must be a whole number from {low} to {high}, got {text!r}"
+                f"must be a whole number from {low} to {high}, got {shown(text)}"
             )
         return value
 
@@ -132,7 +133,7 @@ def positive_number(high: float) -> Callable[[str], float]:
         value = float(text) if _NUMBER.fullmatch(text) else 0.0
         if not 0.0 < value <= high:
             raise argparse.ArgumentTypeError(
-                f"must be a number above 0, up to {high:g}, got {text!r}"
+                f"must be a number above 0, up to {high:g}, got {shown(text)}"
             )
         return value
 
@@ -149,10 +150,10 @@ def output_file(*endings: str) -> Callable[[str], Path]:
         file = Path(text)
         if file.suffix.lower() not in endings:
             raise argparse.ArgumentTypeError(
-                f"the file must end in {' or '.join(endings)}, got {text!r}"
+                f"the file must end in {' or '.join(endings)}, got {shown(text)}"
             )
         if file.is_dir():
-            raise argparse.ArgumentTypeError(f"{text!r} is a folder, name a file")
+            raise argparse.ArgumentTypeError(f"{shown(text)} is a folder, name a file")
         if not file.parent.is_dir():
             raise argparse.ArgumentTypeError(f"folder {str(file.parent)!r} does not exist")
         return file
@@ -180,12 +181,14 @@ def parse_value(text: str) -> Any:
             return _CONSTANTS[name]
     if not text.startswith(("[", "{", '"', "'")):
         return text
-    import yaml  # Few command lines need it at all.
+    # Few command lines need it at all.
+    from sb3_roles.common.yaml_text import YamlError, load_yaml
 
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ValueError(f"not valid YAML: {text!r}") from None
+        return load_yaml(text)
+    except YamlError as error:
+        why = str(error).removeprefix("line 1: ")
+        raise ValueError(f"not valid YAML: {shown(text)}: {why}") from None
 
 
 def key_value(text: str) -> tuple[str, Any]:
@@ -197,7 +200,9 @@ def key_value(text: str) -> tuple[str, Any]:
     """
     key, colon, value = text.partition(":")
     if not (colon and value and key.isidentifier()):
-        raise argparse.ArgumentTypeError(f"must be key:value, such as horizon:100, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"must be key:value, such as horizon:100, got {shown(text)}"
+        )
     try:
         return key, parse_value(value)
     except ValueError as error:

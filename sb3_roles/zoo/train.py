@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.common.names import shown
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import ConfigError
 from sb3_roles.zoo.config_checks import VEC_ENVS
@@ -45,7 +46,7 @@ def joint_steps(text: str) -> int:
     number = value if isinstance(value, (int, float)) and not isinstance(value, bool) else 0
     if not 1 <= number <= 10**12 or number != int(number):
         raise argparse.ArgumentTypeError(
-            f"must be a whole number from 1 to {10**12} joint steps, got {text!r}"
+            f"must be a whole number from 1 to {10**12} joint steps, got {shown(text)}"
         )
     return int(number)
 
