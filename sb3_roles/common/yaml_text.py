@@ -16,6 +16,7 @@ from sb3_roles.common.names import one_line, shown
 
 # Values of a file with all its aliases written out; files of this package have some hundreds.
 _MOST_VALUES = 20_000
+_DEEPEST = 50
 
 
 class YamlError(ValueError):
@@ -61,6 +62,16 @@ def _refuse(node: Node, problem: str) -> YamlError:
 
 class _Loader(yaml.SafeLoader):
     """PyYAML's safe loader, without its surprises."""
+
+    _depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self._depth += 1
+        if self._depth > _DEEPEST:
+            raise YamlError(f"more than {_DEEPEST} lists and mappings within each other")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
     def get_single_node(self) -> Any:
         node = super().get_single_node()

@@ -40,7 +40,7 @@ _OPTIMIZER = Options(
         "fused": Flag(),
         "foreach": Flag(),
         "eps": Number(0.0, 1.0, above=True),
-        "betas": Items(_UNIT, least=2),
+        "betas": Items(_UNIT, least=2, most=2),
         "weight_decay": Number(0.0, 1.0),
         "amsgrad": Flag(),
     }

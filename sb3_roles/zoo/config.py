@@ -7,6 +7,8 @@ The layout is rl-zoo's: an environment's name (or ``default``) at the top, then 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,8 @@ _CONFIGS = (
     Path(__file__).resolve().parents[2] / "zoo_configs",
     Path(__file__).resolve().parent / "configs",
 )
-_MAX_BYTES = 1 << 20
+# PyYAML reads as much in some tenths of a second; the files of this package have up to 12 KB.
+_MAX_BYTES = 1 << 16
 
 
 class ConfigError(UsageError):
@@ -51,7 +54,7 @@ def read_yaml(path: Path) -> Any:
     :param path: the file
     :raises ConfigError: if it can not be read
     """
-    from sb3_roles.common.yaml_text import YamlError, load_yaml
+    from sb3_roles.common.yaml_text import YamlError
 
     try:
         # Bounded: a device has no size, and no end.
@@ -62,13 +65,22 @@ def read_yaml(path: Path) -> Any:
     if len(content) > _MAX_BYTES:
         raise ConfigError([f"{path}: larger than {_MAX_BYTES} bytes, this is no configuration"])
     try:
-        return load_yaml(content.decode("utf-8"))
+        # A copy: callers may change what they get.
+        return deepcopy(_parsed(content.decode("utf-8")))
     except UnicodeDecodeError as error:
         raise ConfigError(
             [f"{path}: not valid YAML: must be text in UTF-8, byte {error.start} is not"]
         ) from None
     except YamlError as error:
         raise ConfigError([f"{path}: not valid YAML: {error}"]) from None
+
+
+@lru_cache(maxsize=32)
+def _parsed(text: str) -> Any:
+    """Read YAML once: plans name the same few files again and again, and PyYAML is slow."""
+    from sb3_roles.common.yaml_text import load_yaml
+
+    return load_yaml(text)
 
 
 def write_yaml(path: Path, values: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable
@@ -159,6 +160,23 @@ def output_file(*endings: str) -> Callable[[str], Path]:
         return file
 
     return path
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """Find out, before work that takes long, whether a folder can be made, or written to.
+
+    :param option: that names it
+    :param folder: it is not made
+    :raises UsageError: if it can not
+    """
+    try:
+        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    except OSError as error:
+        raise UsageError(f"argument {option}: {folder}: {error.strerror}") from None
+    if not there.is_dir():
+        raise UsageError(f"argument {option}: {there} is no folder")
+    if not os.access(there, os.W_OK):
+        raise UsageError(f"argument {option}: {str(there)!r} can not be written")
 
 
 def parse_value(text: str) -> Any:

@@ -184,18 +184,22 @@ class Items:
     :param item: what each of its entries may be; None for texts
     :param optional: null is allowed, too
     :param least: shortest length
+    :param most: longest length; None for any
     """
 
     item: Range | None = None
     optional: bool = False
     least: int = 0
+    most: int | None = None
 
     def problem(self, value: Any) -> str | None:
         """See :class:`Range`."""
         if value is None and self.optional:
             return None
-        if isinstance(value, str) or not isinstance(value, Sequence) or len(value) < self.least:
-            return f"must be a list of at least {self.least}, got {shown(value)}"
+        is_list = isinstance(value, Sequence) and not isinstance(value, str)
+        if not is_list or not self.least <= len(value) <= (self.most or len(value)):
+            length = "" if self.most == self.least else "at least "
+            return f"must be a list of {length}{self.least}, got {shown(value)}"
         for entry in value:
             problem = (self.item or Text()).problem(entry)
             if problem is not None:

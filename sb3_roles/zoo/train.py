@@ -17,6 +17,7 @@ from sb3_roles.zoo.options import (
     DEVICES,
     MAX_TRAINING_SEED,
     KeyValues,
+    check_folder,
     int_text,
     key_value,
     one_of,
@@ -148,6 +149,7 @@ def run(args: argparse.Namespace) -> int:
             runs, jobs = new_jobs(given)
         for job in jobs:
             check_ray_options(job["options"], job["config"], len(jobs) > 1)
+        _check_folders(jobs[0]["options"])
     except ConfigError as error:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
@@ -166,6 +168,12 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.parser.prog}: error: {error}", file=sys.stderr)
         return EXIT_DIVERGED
     return 0
+
+
+def _check_folders(options: Mapping[str, Any]) -> None:
+    for name in ("log_folder", "tensorboard_log"):
+        if options[name] is not None:
+            check_folder(f"--{name.replace('_', '-')}", Path(options[name]))
 
 
 def _fan_out(args: argparse.Namespace, runs: list[RunName], options: Mapping[str, Any]) -> int:
