@@ -49,9 +49,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     :param gae_lambda: for stock algorithms
     :param gamma: for stock algorithms
     :param n_envs: rows
+    :ivar taken: int64 (b,), the pairs of the minibatch that :meth:`get` returned last
     """
 
     observation_space: spaces.Dict
+    taken: th.Tensor | None
 
     def __init__(
         self,
@@ -85,6 +87,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self.pos = 0
         self.full = False
         self.generator_ready = False
+        self.taken = None
 
     def _allocate_for(self, observations: Mapping[str, th.Tensor], chosen: Streams) -> None:
         """Allocate, unless the last rollout had the same shapes: the teams may have changed."""
@@ -314,6 +317,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         assert self.full, "the rollout is not complete"
         teams = None if batch_size is None else max(1, batch_size // self.n_agents)
         for index in self.pairs(teams):
+            self.taken = index
             yield DictRolloutBufferSamples(
                 observations=self._observations_at(index),
                 actions=self._take(self._actions, index),

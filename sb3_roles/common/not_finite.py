@@ -21,8 +21,7 @@ MOST_BYTES = 64 << 20
 class NotFiniteError(FloatingPointError, ValueError):
     """A NaN or an infinity in what is learned from; nothing was learned from it.
 
-    :param part: ``observation``, ``reward``, ``reward component``, ``return``, ``advantage``,
-        ``loss`` or ``gradient``
+    :param part: ``observation``, ``reward``, ``return``, ``advantage``, ``loss`` or ``gradient``
     :param message: one line: what, where, and what may help
     :param tensors: what it was found in, by name
     """
@@ -33,6 +32,9 @@ class NotFiniteError(FloatingPointError, ValueError):
         super().__init__(message)
         self.part = part
         self.tensors = dict(tensors or {})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.part, str(self), self.tensors)
 
     def found_in(self, where: str, tensors: Mapping[str, th.Tensor | np.ndarray]) -> NotFiniteError:
         """Return the error with the minibatch that it was found in.
@@ -51,7 +53,10 @@ def dump(path: Path, error: NotFiniteError) -> bool:
     :return: False if there is nothing to write
     :raises OSError: if the disk refuses
     """
-    tensors = {name: th.as_tensor(value).detach() for name, value in error.tensors.items()}
+    tensors = {
+        name: (th.from_numpy(np.array(one)) if isinstance(one, np.ndarray) else one).detach()
+        for name, one in error.tensors.items()
+    }
     if not tensors:
         return False
     total = sum(tensor.nbytes for tensor in tensors.values())

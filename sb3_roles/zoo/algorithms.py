@@ -220,6 +220,11 @@ class Algorithm:
     clones: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def checks_steps(self) -> bool:
+        """Whether it refuses by itself to learn from numbers that are not finite."""
+        return self.path.startswith("sb3_roles.")
+
     def load(self) -> Any:
         """Import the class."""
         return load_object(self.path)
