@@ -83,7 +83,7 @@ def commands(setting: Setting) -> Outcome:
         if apart is None or k in apart:
             ways.append(in_a_process)
         for way in ways:
-            folder = setting.folder / f"{k}_{way.__name__}"
+            folder = setting.folder / str(tried)
             found, seconds = attempt(case, folder, way)
             slowest = max(slowest, seconds)
             tried += 1
