@@ -194,10 +194,10 @@ def test_steps_that_nobody_looks_at_are_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr(mappo, "check_loss", lambda loss: None)
     clip = th.nn.utils.clip_grad_norm_
     monkeypatch.setattr(th.nn.utils, "clip_grad_norm_", lambda found, most, **_: clip(found, most))
-    found = trial(tmp_path, "mappo", "loss")
+    found = trial(tmp_path / "run", "mappo", "loss")
     assert "weights or optimizer changed" in found
 
 
 def test_a_stock_algorithm_without_the_guard_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_roles.zoo.models.guard_optimizer", lambda policy: None)
-    assert "weights or optimizer changed" in trial(tmp_path, "ppo", "gradient")
+    assert "weights or optimizer changed" in trial(tmp_path / "run", "ppo", "gradient")
