@@ -217,7 +217,7 @@ STOPPED = [
     (["report", "--rows", "random"], "sb3_roles.evaluation.grid.play.play"),
     (["publish", "--runs", "mappo=run"], "sb3_roles.zoo.publish.named_runs"),
     (["ablations", "--dry-run"], "sb3_roles.zoo.ablation_runs.find_runs"),
-    (["bench", "env"], "sb3_roles.zoo.bench_env.measure"),
+    (["bench", "env"], "sb3_roles.zoo.bench_env.measure_startup"),
     (["prove", "R7"], "sb3_roles.prove.promises.Promise.prove"),
     (["train.py", "-n", "9"], "sb3_roles.zoo.train.new_jobs"),
     (["train.py", "--resume", "run"], "sb3_roles.zoo.job.make_env"),
