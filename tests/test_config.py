@@ -160,6 +160,7 @@ FILES_BY_NAME = {path.stem: path for path in FILES}
     [
         (
             {
+                "env_kwargs": {"sub_goal": "nearest"},
                 "wrapper_kwargs": {"roles": ["cover", "explore"]},
                 "policy_kwargs": {"goal_key": "sub_goal"},
             },

@@ -72,7 +72,7 @@ WRONG = [
     (["-xn5"], "unknown option '-xn5'"),
     (["extra"], "unexpected argument 'extra'"),
     (["--n-agents", "2", "-f", "/proc/none/logs"], "/proc/none"),
-    (["-tb", "/dev/null"], "/dev/null: File exists"),
+    (["-tb", "/dev/null"], "/dev/null is no folder"),
     (["-params", "policy_kwargs:{optimizer_kwargs: null}"], "keys and values, got None"),
     (["--env-kwargs", "sub_goal:none", "-params", "gama:1"], "did you mean 'gamma'?"),
     (["-conf", str(ROOT / "zoo_configs")], "zoo_configs: Is a directory"),

@@ -210,7 +210,8 @@ def unknown(what: str, given: object, allowed: Any) -> str:
     :return: the message
     """
     names = [str(name) for name in allowed]
-    close = difflib.get_close_matches(str(given), names, n=1)
+    # Not of a long text: that search takes minutes.
+    close = difflib.get_close_matches(str(given)[:100], names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return f"unknown {what} {shown(given)}: allowed are {', '.join(names)}{hint}"
 

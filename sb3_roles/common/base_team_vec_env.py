@@ -16,6 +16,7 @@ from sb3_roles.common.env_declarations import (
     declared_goals,
     env_layers,
 )
+from sb3_roles.common.not_finite import NotFiniteError
 
 
 def team_seeds(seed: int | None, n: int) -> list[int]:
@@ -99,6 +100,7 @@ class TeamVecEnv(VecEnv):
         self._closed = False
         super().__init__(n_teams * self.n_agents, observation_space, action_space)
         self.metadata = {**self.metadata, **(declared(env, "metadata") or {})}
+        self._float_keys = _float_keys(observation_space)
         self._clear_records()
 
     def _clear_records(self) -> None:
@@ -166,6 +168,7 @@ class TeamVecEnv(VecEnv):
         options = self._options[:: self.n_agents]
         self._clear_records()
         observations = self._reset_all(seeds, options)
+        self._check_seen(observations, " after reset()")
         self._reset_seeds()
         self._reset_options()
         self._started = True
@@ -194,18 +197,45 @@ class TeamVecEnv(VecEnv):
 
     def _check_rewards(self, rewards: np.ndarray) -> None:
         """
-        Refuse rewards that would poison the returns.
+        Refuse rewards, or components of them, that would poison the returns.
 
-        :param rewards: float32, ``num_envs`` elements in row order
-        :raises ValueError: naming team and agent, if one is NaN or infinite
+        :param rewards: float32, ``num_envs`` elements in row order; ``reward_components`` are set
+        :raises NotFiniteError: naming team and agent, if one is NaN or infinite
         """
-        if np.isfinite(rewards).all():
+        self._check_finite("reward", rewards.ravel(), "correct the environment's reward function")
+        if self.component_names:
+            advice = f"correct one of the components {', '.join(self.component_names)}"
+            self._check_finite("reward component", self.reward_components, advice)
+
+    def _check_seen(self, observations: VecEnvObs, when: str = "") -> None:
+        """
+        Refuse observations that would poison the networks; integers are always finite.
+
+        :param observations: of all rows, or of all teams for keys that are given once per team
+        :param when: added to the message
+        :raises NotFiniteError: naming key, team and agent, if a number is NaN or infinite
+        """
+        for key in self._float_keys:
+            values: Any = observations[key] if isinstance(observations, dict) else observations
+            what = f"observation {key!r}{when}" if key else f"observation{when}"
+            self._check_finite(what, values, "correct what the environment observes")
+
+    def _check_finite(self, what: str, values: np.ndarray, advice: str) -> None:
+        finite = np.isfinite(values)
+        if finite.all():
             return
-        row = int(np.flatnonzero(~np.isfinite(rewards))[0])
-        team, agent = divmod(row, self.n_agents)
-        raise ValueError(
-            f"reward {rewards.flat[row]} of team {team}, agent {self.agents[agent]!r} (row {row}) "
-            "is not finite in float32: correct the environment's reward function"
+        rows = finite.reshape(len(values), -1)
+        row = int(np.flatnonzero(~rows.all(axis=1))[0])
+        value = values.reshape(len(values), -1)[row][~rows[row]][0]
+        if len(values) == self.num_envs:
+            team, agent = divmod(row, self.n_agents)
+            of = f"team {team}, agent {self.agents[agent]!r} (row {row})"
+        else:
+            of = f"team {row}"
+        raise NotFiniteError(
+            what.split()[0],
+            f"{what} {value} of {of} is not finite in {values.dtype}: {advice}",
+            {what.split()[0]: values},
         )
 
     def _teams_of(self, indices: VecEnvIndices) -> list[int]:
@@ -317,3 +347,13 @@ class TeamVecEnv(VecEnv):
         if not self._closed:
             self._closed = True
             self._close()
+
+
+def _float_keys(space: spaces.Space) -> tuple[str, ...]:
+    """Keys of an observation that may be NaN; ``""`` for an observation without keys."""
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    return tuple(
+        key
+        for key, part in parts.items()
+        if part.dtype is not None and np.issubdtype(part.dtype, np.floating)
+    )

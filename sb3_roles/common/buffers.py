@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples
 
 from sb3_roles.common.losses import lambda_returns
+from sb3_roles.common.not_finite import NotFiniteError
 from sb3_roles.common.observation_store import ObservationStore, take_groups
 from sb3_roles.common.policies import Streams
 from sb3_roles.common.team_wrapper import AGENT_KEY
@@ -48,9 +49,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
     :param gae_lambda: for stock algorithms
     :param gamma: for stock algorithms
     :param n_envs: rows
+    :ivar taken: int64 (b,), the pairs of the minibatch that :meth:`get` returned last
     """
 
     observation_space: spaces.Dict
+    taken: th.Tensor | None
 
     def __init__(
         self,
@@ -84,6 +87,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self.pos = 0
         self.full = False
         self.generator_ready = False
+        self.taken = None
 
     def _allocate_for(self, observations: Mapping[str, th.Tensor], chosen: Streams) -> None:
         """Allocate, unless the last rollout had the same shapes: the teams may have changed."""
@@ -162,7 +166,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param gae_lambda: float (S,)
         :param normalize_advantage: to mean 0 and deviation 1 over the rows in which a stream
             decided, per stream
-        :raises FloatingPointError: if a return is not finite
+        :raises NotFiniteError: if a return or an advantage is not finite
         """
         self._returns = lambda_returns(
             self._rewards,
@@ -172,11 +176,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             gamma,
             gae_lambda,
         )
-        if not th.isfinite(self._returns).all():
-            raise FloatingPointError(
-                "a return is not finite: check the environment's rewards and the critics' values; "
-                "nothing was learned from this rollout"
-            )
+        self._check("return", self._returns)
         self._advantages = self._returns - self._values
         if normalize_advantage:
             for s in range(self._advantages.shape[2]):
@@ -184,6 +184,23 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 if len(used) > 1:
                     scaled = (self._advantages[..., s] - used.mean()) / (used.std() + 1e-8)
                     self._advantages[..., s] = scaled
+        self._check("advantage", self._advantages)
+
+    def _check(self, part: str, values: th.Tensor) -> None:
+        """Refuse returns or advantages that are not finite, float (T, n, S)."""
+        found = th.isfinite(values)
+        if found.all():
+            return
+        t, row, stream = (~found).nonzero()[0].tolist()
+        team, agent = divmod(row, self.n_agents)
+        names = ("rewards", "values", "expected_values", "returns", "advantages", "ends")
+        raise NotFiniteError(
+            part,
+            f"the {part} of stream {stream} is {values[t, row, stream].item()} in step {t} of the "
+            f"rollout, team {team}, robot {agent}: check the environment's rewards and the "
+            "critics' values; nothing was learned from this rollout",
+            {name: getattr(self, f"_{name}") for name in names},
+        )
 
     def _take(self, memory: th.Tensor, index: th.Tensor) -> th.Tensor:
         return take_groups(memory, index, self.n_agents)
@@ -224,6 +241,17 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             self._take(self._returns, index),
             self._take(self._active, index),
         )
+
+    def named(self, index: th.Tensor) -> dict[str, th.Tensor]:
+        """Return a minibatch as tensors by name, rows first, to be written to a file.
+
+        :param index: int64 (b,), of :meth:`pairs`
+        """
+        batch = self.samples(index)
+        by_name = {f"observations.{key}": value for key, value in batch.observations.items()}
+        by_name |= {f"old_log_probs.{s}": value for s, value in enumerate(batch.old_log_probs)}
+        rest = ("actions", "advantages", "returns", "active")
+        return by_name | {name: getattr(batch, name) for name in rest}
 
     def n_active(self, index: th.Tensor) -> list[float]:
         """Count the rows of some pairs in which each stream decided."""
@@ -289,6 +317,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         assert self.full, "the rollout is not complete"
         teams = None if batch_size is None else max(1, batch_size // self.n_agents)
         for index in self.pairs(teams):
+            self.taken = index
             yield DictRolloutBufferSamples(
                 observations=self._observations_at(index),
                 actions=self._take(self._actions, index),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch as th
@@ -13,6 +14,8 @@ from sb3_roles.common.distributions import entropy, kl_divergence, pick
 _KL_HIGH, _KL_LOW, _KL_UP, _KL_DOWN = 2.0, 0.5, 1.5, 0.5
 # Our bounds on it: without, a long calm phase would switch the penalty off for good.
 _KL_COEF_MIN, _KL_COEF_MAX = 1.0e-4, 1.0e2
+# On CPUs at most 1e-8 was seen, with bfloat16, too; GPUs choose products by the number of rows.
+_SAME_KL = 1.0e-4
 
 
 def lambda_returns(
@@ -101,6 +104,26 @@ def stream_loss(
     with th.no_grad():
         clip_fraction = (weight * ((ratio - 1.0).abs() > clip_range)).sum()
     return StreamLoss(loss, policy_loss, value_loss, mean_entropy, kl, clip_fraction)
+
+
+def check_same_policy(names: Sequence[str], losses: Sequence[StreamLoss]) -> None:
+    """Refuse a first minibatch whose policy is not the one that acted.
+
+    Before the first step the weights are those of the rollout: every ratio is 1 and the KL
+    divergence 0, up to rounding, which depends on the number of rows.
+
+    :param names: of the streams
+    :param losses: of the first minibatch after a rollout, one for each stream
+    :raises ValueError: if a stream's divergence is more than rounding
+    """
+    for name, loss in zip(names, losses, strict=True):
+        kl = float(loss.kl)
+        if kl > _SAME_KL:
+            raise ValueError(
+                f"the {name} policy that learns is not the one that acted: before the first step "
+                f"they diverge by {kl:.2g} nats, more than the {_SAME_KL:g} of rounding; a layer "
+                "such as dropout or batch normalization computes differently while training"
+            )
 
 
 def adapt_kl_coef(kl_coef: float, kl: float, kl_target: float) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_LONGEST = 120
+
 
 def closest(what: str, name: object, allowed: Iterable[object]) -> str:
     """One line for an unknown name: what is allowed, and the closest match.
@@ -14,14 +16,37 @@ def closest(what: str, name: object, allowed: Iterable[object]) -> str:
     :param allowed: the known names, or numbers
     """
     known = {str(one): one for one in allowed}
-    close = difflib.get_close_matches(str(name), known, n=1)
+    # Not of a long text: that search takes minutes.
+    close = difflib.get_close_matches(str(name)[:_LONGEST], known, n=1)
     hint = f"; did you mean {known[close[0]]!r}?" if close else ""
-    return f"unknown {what} {name!r}: allowed are {', '.join(known) or 'none'}{hint}"
+    return f"unknown {what} {shown(name)}: allowed are {', '.join(known) or 'none'}{hint}"
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it: on one line, printable, and not too long.
+
+    :param value: anything that a user gave
+    """
+    text = printable(repr(value))
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[: _LONGEST - 20]}... ({len(text):,} characters)"
+
+
+def printable(text: str) -> str:
+    """Return a text on one line, with what a terminal could not show, or would obey, escaped.
+
+    :param text: such as a message with the name of a file, which may hold anything
+    """
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode()
+        for c in " ".join(text.split())
+    )
 
 
 def one_line(error: BaseException) -> str:
     """Return what an error says, for the end of a message of one line."""
-    return " ".join(str(error).split())
+    return printable(str(error))
 
 
 def span_text(low: int, high: int) -> str:

@@ -188,25 +188,36 @@ class NativeTeamVecEnv(TeamVecEnv):
         Step all teams; those that finish start their next episode.
 
         :return: observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos
-        :raises ValueError: if a reward is not finite
+        :raises NotFiniteError: if a reward or an observation is not finite
         """
         batched = self.batched
         batched.step(self._actions.reshape(self.n_teams, self.n_agents, *self._actions.shape[1:]))
         # Copies, here and below: SB3 adds the value at the horizon to the rewards in place.
         rewards = np.array(batched.rewards, np.float32).reshape(self.num_envs)
-        self._check_rewards(rewards)
         self.reward_components = np.array(batched.reward_components, np.float32).reshape(
             self.num_envs, len(self.component_names)
         )
+        self._check_rewards(rewards)
         self.metrics = {
             name: np.array(batched.metrics[name], np.float64) for name in self.metric_names
         }
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = batched.terminated | batched.truncated
         if done.any():
+            self._check_last(batched.observations)
             self._add_terminal_infos(infos, done)
             batched.reset_teams(done)
-        return self._copy_observations(), rewards, np.repeat(done, self.n_agents), infos
+        observations = self._copy_observations()
+        self._check_seen(observations)
+        return observations, rewards, np.repeat(done, self.n_agents), infos
+
+    def _check_last(self, observations: dict[str, np.ndarray]) -> None:
+        """Check them before the reset; values of the last ones are bootstrapped with."""
+        by_row = {
+            key: observations[key].reshape(-1, *observations[key].shape[len(self._lead(key)) :])
+            for key in self._float_keys
+        }
+        self._check_seen(by_row, " at the end of an episode")
 
     def _add_terminal_infos(self, infos: list[dict[str, Any]], done: np.ndarray) -> None:
         """

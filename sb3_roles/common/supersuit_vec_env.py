@@ -251,22 +251,37 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
         Step all teams; those that finish start their next episode.
 
         :return: observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos
-        :raises ValueError: if a reward is not finite, agents do not finish together, or a declared
-            reward component or metric is missing
+        :raises NotFiniteError: if a reward or an observation is not finite
+        :raises ValueError: if agents do not finish together, or a declared reward component or
+            metric is missing
         """
         observations, rewards, terminated, truncated, infos = self._vec.step(self._actions)
-        self._check_rewards(rewards)
         if self.component_names:
             self.reward_components = np.concatenate([r.component_values for r in self._recorders])
+        self._check_rewards(rewards)
+        self._check_seen(observations)
         if self.metric_names:
             values = np.stack([recorder.metric_values for recorder in self._recorders], axis=1)
             self.metrics = dict(zip(self.metric_names, values, strict=True))
         dones = (terminated | truncated).astype(bool)
+        if dones.any():
+            self._check_last(infos)
         for row in np.flatnonzero(dones).tolist():
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
             team, agent = divmod(row, self.n_agents)
             self.reset_infos[row] = self._recorders[team].reset_infos[agent]
         return self._collapse(observations), rewards, dones, infos
+
+    def _check_last(self, infos: list[dict[str, Any]]) -> None:
+        """Check the last observations of finished episodes, which are bootstrapped with."""
+        for row, info in enumerate(infos):
+            last = info.get("terminal_observation")
+            for key in self._float_keys if last is not None else ():
+                part = last[key] if key else last
+                if not np.isfinite(part).all():
+                    every = np.zeros((self.num_envs, *np.shape(part)), np.float32)
+                    every[row] = part
+                    self._check_seen({key: every} if key else every, " at the end of an episode")
 
     def _team_env(self, team: int) -> object:
         return self._recorders[team].env

@@ -19,6 +19,7 @@ from sb3_roles.baselines.area import area_scene
 from sb3_roles.common.checks import check_not_negative, check_positive, check_unit
 from sb3_roles.common.distributions import LOG_ZERO
 from sb3_roles.common.names import one_line
+from sb3_roles.common.not_finite import NotFiniteError
 from sb3_roles.common.policies import TeamPolicy
 from sb3_roles.common.shards import trainable
 from sb3_roles.gnn.demonstrations import DemonstrationError
@@ -264,7 +265,11 @@ class GNN(MAPPO):
             update_learning_rate(self.policy.optimizer, rate)
             loss, accuracy = self._cross_entropy(*batch)
             gradients = th.autograd.grad(loss, trainable(self.policy), allow_unused=True)
-            self._optimize(loss, gradients)
+            try:
+                self._optimize(loss, gradients)
+            except NotFiniteError as error:
+                where = f"update {self._n_updates + 1}"
+                raise error.found_in(where, {**batch[0], "actions": batch[1]}) from None
             self._n_updates += 1
             losses.append(loss.detach())
             right.append(accuracy)

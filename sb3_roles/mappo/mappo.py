@@ -19,7 +19,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.checks import check_not_negative, check_positive, check_trusted, check_unit
-from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, stream_loss
+from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, check_same_policy, stream_loss
+from sb3_roles.common.not_finite import NotFiniteError, check_loss, gradient_error
 from sb3_roles.common.policies import TeamPolicy
 from sb3_roles.common.rollout_steps import LocalPlayer, RolloutPlayer
 from sb3_roles.common.rollouts import make_groups, split_teams
@@ -318,13 +319,19 @@ class MAPPO(OnPolicyAlgorithm):
             for _ in range(self.n_epochs):
                 for index in self.rollout_buffer.pairs(self.batch_size):
                     losses, gradients = self._differentiate(index, settings, crew)
+                    if n_steps == 0:
+                        check_same_policy(self.policy.stream_names, losses)
                     for records, loss in zip(history, losses, strict=True):
                         records.append(loss)
                     if self._too_far(losses):
                         stopped = True
                         break
                     # L = L_p + L_r (Eq. 9)
-                    self._optimize(th.stack([part.loss for part in losses]).sum(), gradients)
+                    try:
+                        self._optimize(th.stack([part.loss for part in losses]).sum(), gradients)
+                    except NotFiniteError as error:
+                        where = f"minibatch {n_steps + 1} of update {self._n_updates + 1}"
+                        raise error.found_in(where, self.rollout_buffer.named(index)) from None
                     n_steps += 1
                 self._n_updates += 1
                 if stopped:
@@ -395,20 +402,18 @@ class MAPPO(OnPolicyAlgorithm):
                 self.policy.streams(obs, deterministic=True)
 
     def _optimize(self, loss: th.Tensor, gradients: Gradients) -> None:
-        """Take one step, unless it would destroy the weights."""
-        if not th.isfinite(loss):
-            raise FloatingPointError(
-                f"the loss is {loss.item()}: no step was taken; check rewards and observations, or "
-                "lower learning_rate"
-            )
+        """Take one step, unless it would destroy the weights.
+
+        :raises NotFiniteError: if the loss or a gradient is not finite
+        """
+        check_loss(loss)
         set_gradients(trainable(self.policy), gradients)
         limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
-        norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), limit)
-        if not th.isfinite(norm):
-            raise FloatingPointError(
-                f"the gradient norm is {float(norm)}: no step was taken; lower learning_rate, or "
-                "try precision='fp32'"
-            )
+        try:
+            # The sum of squares, which is computed to clip anyway, tells it.
+            th.nn.utils.clip_grad_norm_(self.policy.parameters(), limit, error_if_nonfinite=True)
+        except RuntimeError as error:
+            raise gradient_error(self.policy) from error
         self.policy.optimizer.step()
 
     def _log_update(self, history: list[list[StreamLoss]], n_steps: int) -> None:

@@ -133,6 +133,8 @@ def run(args: Namespace) -> int:
     :raises UsageError: if the file, a name or a folder is wrong, before anything is trained
     :raises OSError: if something can not be written
     """
+    if args.train and args.dry_run:
+        raise UsageError("give --train or --dry-run, not both")
     ablations = read_ablations(args)
     jobs = args.jobs or usable_cores()
     new = (LOGS, args.log_folder) if args.train else (LOGS,)
@@ -140,8 +142,6 @@ def run(args: Namespace) -> int:
         if folder not in new and not folder.is_dir():
             option = "--log-folder" if folder == args.log_folder else "--runs"
             raise UsageError(f"argument {option}: {str(folder)!r} is no folder")
-    if args.train and args.dry_run:
-        raise UsageError("give --train or --dry-run, not both")
     check_out(args.out, write=not args.dry_run)
     if args.train:
         prepare_process()

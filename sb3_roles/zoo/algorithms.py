@@ -40,7 +40,7 @@ _OPTIMIZER = Options(
         "fused": Flag(),
         "foreach": Flag(),
         "eps": Number(0.0, 1.0, above=True),
-        "betas": Items(_UNIT, least=2),
+        "betas": Items(_UNIT, least=2, most=2),
         "weight_decay": Number(0.0, 1.0),
         "amsgrad": Flag(),
     }
@@ -219,6 +219,11 @@ class Algorithm:
     holds_roles: bool = True
     clones: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def checks_steps(self) -> bool:
+        """Whether it refuses by itself to learn from numbers that are not finite."""
+        return self.path.startswith("sb3_roles.")
 
     def load(self) -> Any:
         """Import the class."""

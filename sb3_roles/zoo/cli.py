@@ -63,7 +63,10 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
     if hasattr(sys.stdout, "reconfigure"):
         # A terminal that can not show "±" gets "?", not a traceback.
         sys.stdout.reconfigure(errors="replace")
-    parser = make_parser(script)
+    try:
+        parser = make_parser(script)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         try:

@@ -7,12 +7,13 @@ The layout is rl-zoo's: an environment's name (or ``default``) at the top, then 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from sb3_roles.common.files import open_regular, write_atomically
-from sb3_roles.common.names import closest
-from sb3_roles.common.safe_yaml import parse_yaml
+from sb3_roles.common.names import closest, printable, shown
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config_checks import (
     IDENTITY,
@@ -32,7 +33,8 @@ _CONFIGS = (
     Path(__file__).resolve().parents[2] / "zoo_configs",
     Path(__file__).resolve().parent / "configs",
 )
-_MAX_BYTES = 1 << 20
+# PyYAML reads as much in some tenths of a second; the files of this package have up to 12 KB.
+_MAX_BYTES = 1 << 16
 
 
 class ConfigError(UsageError):
@@ -42,7 +44,7 @@ class ConfigError(UsageError):
     """
 
     def __init__(self, lines: Iterable[str]) -> None:
-        self.lines = tuple(" ".join(str(line).split()) for line in lines)
+        self.lines = tuple(printable(str(line)) for line in lines)
         super().__init__("; ".join(self.lines))
 
 
@@ -52,20 +54,33 @@ def read_yaml(path: Path) -> Any:
     :param path: the file
     :raises ConfigError: if it can not be read
     """
-    import yaml
+    from sb3_roles.common.yaml_text import YamlError
 
     try:
         with open_regular(path) as file:
+            # Bounded: it may grow while it is read.
             content = file.read(_MAX_BYTES + 1)
-        if len(content) > _MAX_BYTES:
-            raise ConfigError([f"{path}: larger than {_MAX_BYTES} bytes, this is no configuration"])
-        return parse_yaml(content.decode())
     except OSError as error:
         raise ConfigError([f"{path}: {error.strerror or error}"]) from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
+    if len(content) > _MAX_BYTES:
+        raise ConfigError([f"{path}: larger than {_MAX_BYTES} bytes, this is no configuration"])
+    try:
+        # A copy: callers may change what they get.
+        return deepcopy(_parsed(content.decode("utf-8")))
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            [f"{path}: not valid YAML: must be text in UTF-8, byte {error.start} is not"]
+        ) from None
+    except YamlError as error:
         raise ConfigError([f"{path}: not valid YAML: {error}"]) from None
+
+
+@lru_cache(maxsize=32)
+def _parsed(text: str) -> Any:
+    """Read YAML once: plans name the same few files again and again, and PyYAML is slow."""
+    from sb3_roles.common.yaml_text import load_yaml
+
+    return load_yaml(text)
 
 
 def write_yaml(path: Path, values: Mapping[str, Any]) -> None:
@@ -110,7 +125,7 @@ def load_settings(algo: str, env: str, file: Path | None = None) -> dict[str, An
         message = closest("environment", env, [*map(str, content), DEFAULT])
         raise ConfigError([f"{path}: {message}"])
     if not isinstance(settings, dict):
-        raise ConfigError([f"{path}: {env} must be keys and values, got {settings!r}"])
+        raise ConfigError([f"{path}: {env} must be keys and values, got {shown(settings)}"])
     return settings
 
 
@@ -135,7 +150,8 @@ def load_identity(file: Path) -> dict[str, Any]:
 def _read_mapping(path: Path) -> dict[Any, Any]:
     content = read_yaml(path)
     if not isinstance(content, dict):
-        raise ConfigError([f"{path}: must be keys and values, got {type(content).__name__}"])
+        got = "nothing" if content is None else type(content).__name__
+        raise ConfigError([f"{path}: must be keys and values, got {got}"])
     return content
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sb3_roles.common.names import closest
-from sb3_roles.common.roles import ROLES, role_controls
+from sb3_roles.common.names import closest, shown
+from sb3_roles.common.roles import NEAREST, ROLES, role_controls
 from sb3_roles.zoo.algorithms import ALGORITHMS, POLICY_ARGUMENTS, Algorithm
 from sb3_roles.zoo.environments import (
     AREA_SEARCH,
     GOAL_SETS,
     REWARD_COMPONENTS,
+    SUB_GOALS,
     env_problems,
     scenes_of_run,
 )
@@ -44,7 +45,7 @@ def config_problems(config: Mapping[str, Any]) -> list[str]:
         return [closest("algorithm", algo, ALGORITHMS)]
     algorithm = ALGORITHMS[algo]
     if not isinstance(env, str):
-        return [f"env must be a name or module:factory, got {env!r}"]
+        return [f"env must be a name or module:factory, got {shown(env)}"]
     top: dict[str, Range] = {
         **_RUN,
         "policy": Choice(tuple(algorithm.policies)),
@@ -58,7 +59,7 @@ def config_problems(config: Mapping[str, Any]) -> list[str]:
     found += problems("", flat, {**top, **dict.fromkeys(NESTED, Weights())})
     for key, value in nested.items():
         if not isinstance(value, Mapping):
-            found.append(f"{key} must be keys and values, got {value!r}")
+            found.append(f"{key} must be keys and values, got {shown(value)}")
     if isinstance(config.get("env_kwargs"), Mapping):
         found += env_problems(env, config["env_kwargs"])
     if isinstance(config.get("wrapper_kwargs"), Mapping):
@@ -95,10 +96,33 @@ def _wrapper_problems(algorithm: Algorithm, env: str, options: Mapping[str, Any]
             if options.get(key, only) != only:
                 found.append(
                     f"wrapper_kwargs.{key} must be {only} for {algorithm.name}, whose policy "
-                    f"chooses a role at every step, got {options[key]!r}"
+                    f"chooses a role at every step, got {shown(options[key])}"
                 )
+    if not found:
+        found += _role_problems(role_names or ("explore", "cover"), options)
     if env == AREA_SEARCH and not found:
         found += _component_problems(options)
+    return found
+
+
+def _role_problems(roles: tuple[str, ...], options: Mapping[str, Any]) -> list[str]:
+    """Roles that are there twice, and weights of roles that are not there."""
+    if len(set(roles)) < len(roles):
+        return [f"wrapper_kwargs.roles must be different ones, each once, got {list(roles)}"]
+    matrix = options.get("primitive_weights")
+    if not isinstance(matrix, Mapping):
+        return []
+    found = [
+        f"wrapper_kwargs.primitive_weights: {closest('role', name, roles)}"
+        for name in matrix
+        if name not in roles
+    ]
+    missing = [name for name in roles if name not in matrix]
+    if missing:
+        found.append(
+            f"wrapper_kwargs.primitive_weights must have weights for each of {', '.join(roles)}, "
+            f"got none for {', '.join(missing)}"
+        )
     return found
 
 
@@ -135,6 +159,7 @@ def _together(config: Mapping[str, Any]) -> list[str]:
         found.append(
             f"rollout_groups must be at most n_envs = {config['n_envs']} teams, got {groups}"
         )
+    found += _policy_problems(config["policy_kwargs"])
     if config["env"] != AREA_SEARCH:
         return found
     env_kwargs, policy_kwargs = config["env_kwargs"], config["policy_kwargs"]
@@ -171,6 +196,28 @@ def _together(config: Mapping[str, Any]) -> list[str]:
     return found
 
 
+def _policy_problems(options: Mapping[str, Any]) -> list[str]:
+    """Arguments of a policy that do not go together."""
+    found = []
+    optimizer = options.get("optimizer_kwargs", {})
+    if optimizer.get("fused") and optimizer.get("foreach"):
+        found.append("policy_kwargs.optimizer_kwargs: fused and foreach must not both be true")
+    heads, width = options.get("n_heads"), options.get("hop_width")
+    if heads is not None and width is not None and width % heads:
+        found.append(
+            f"policy_kwargs.n_heads must divide hop_width, {width}, without a rest, got {heads}"
+        )
+    layer = options.get("norm_layer", "none")
+    if options.get("encoder") == "patches" and layer != "none":
+        found.append(
+            f"policy_kwargs.norm_layer must be none with encoder patches, which have none, got "
+            f"{layer}"
+        )
+    if "state" in (options.get("actor_keys") or ()):
+        found.append("policy_kwargs.actor_keys: actors never read 'state', which is for critics")
+    return found
+
+
 def _mix_problems(config: Mapping[str, Any], n_scenes: int) -> list[str]:
     if n_scenes == 1:
         return []
@@ -192,6 +239,20 @@ def _mix_problems(config: Mapping[str, Any], n_scenes: int) -> list[str]:
 
 def _goal_problems(config: Mapping[str, Any]) -> list[str]:
     """Rows of ``sub_goal`` are those of the goal sets, and a policy takes row k for role k."""
+    if config["env_kwargs"].get("sub_goal", "none") == "none":
+        lacking = [
+            name
+            for name, value in (
+                ("policy_kwargs.goal_key", config["policy_kwargs"].get("goal_key")),
+                ("wrapper_kwargs.role_control", config["wrapper_kwargs"].get("role_control")),
+            )
+            if value in ("sub_goal", NEAREST)
+        ]
+        return [
+            f"{name} needs sub-goals: env_kwargs.sub_goal must be one of "
+            f"{', '.join(SUB_GOALS[1:])}, got none"
+            for name in lacking
+        ]
     roles = [ROLES[name] for name in config["wrapper_kwargs"].get("roles", ("explore", "cover"))]
     sets = tuple(role.goal_set for role in roles)
     if config["policy_kwargs"].get("goal_key") != "sub_goal" or sets == GOAL_SETS:

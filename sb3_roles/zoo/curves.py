@@ -10,10 +10,12 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
+from io import BytesIO
 from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.common.files import write_atomically
 from sb3_roles.common.names import closest
 from sb3_roles.zoo.config import CONFIG_FILE, read_yaml
 from sb3_roles.zoo.options import UsageError, output_file, positive_number
@@ -269,4 +271,6 @@ def _plot(curves: Curves, metrics: Sequence[str], file: Path) -> None:
         axes.set_ylabel(f"{metric} (%)" if metric in _FRACTIONS else metric)
         axes.grid(alpha=0.3)
         axes.legend()
-    figure.savefig(file, dpi=120)
+    image = BytesIO()
+    figure.savefig(image, format="png", dpi=120)
+    write_atomically(file, image.getvalue())

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any
 
 from area_search.scenes import SCENES, Scene, SceneError, get_scenes
-from sb3_roles.common.names import closest
+from sb3_roles.common.names import closest, shown
 from sb3_roles.zoo.options import UsageError
 
 AREA_SEARCH = "area-search-v0"
@@ -36,14 +36,14 @@ def env_problems(env: str, env_kwargs: Mapping[str, Any]) -> list[str]:
     if env not in ENVIRONMENTS:
         if _FACTORY.fullmatch(env):
             wrong = [key for key in env_kwargs if not isinstance(key, str)]
-            return [f"env_kwargs: {key!r} is no name of an argument" for key in wrong]
+            return [f"env_kwargs: {shown(key)} is no name of an argument" for key in wrong]
         return [closest("environment", env, ENVIRONMENTS) + ", or module:factory"]
     options = dict(env_kwargs)
     name, sub_goal = options.pop("scene", "hard"), options.pop("sub_goal", "none")
     found = []
     for key in SHOWN:
         if not isinstance(value := options.pop(key, False), bool):
-            found.append(f"env_kwargs: {key} must be true or false, got {value!r}")
+            found.append(f"env_kwargs: {key} must be true or false, got {shown(value)}")
     if sub_goal not in SUB_GOALS:
         found.append(f"env_kwargs: {closest('sub_goal', sub_goal, SUB_GOALS)}")
     names_of_scenes = name if isinstance(name, list) else [name]

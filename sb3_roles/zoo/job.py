@@ -29,6 +29,7 @@ from sb3_roles.common.env_state import env_gap
 from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
+from sb3_roles.common.not_finite import NOT_FINITE_FILE, NotFiniteError, dump
 from sb3_roles.common.progress_callback import TeamProgressBar
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.evaluation.callback import EvaluationCallback
@@ -210,8 +211,13 @@ def _train_in(
             raise UsageError(f"{run}: {error}") from error
         except UsageError:
             raise
+        except NotFiniteError as error:
+            message = f"{run}: {_kept(run, model, error)}"
+            if options["verbose"] > 1:
+                raise
+            raise TrainingFailed(message) from error
         except (FloatingPointError, ValueError) as error:
-            # Losses, rewards and observations that are not finite, teams that fall apart.
+            # Observations of another shape, teams that fall apart.
             if options["verbose"] > 1:
                 raise
             raise TrainingFailed(f"{run}: {one_line(error)}") from error
@@ -227,6 +233,21 @@ def _train_in(
     stop.check()
     _evaluate(run, model, config, options["eval_episodes"])
     return 0
+
+
+def _kept(run: Path, model: OnPolicyAlgorithm, error: NotFiniteError) -> str:
+    """Keep what numbers that are not finite were found in; return the whole message."""
+    steps = model.num_timesteps // find_team_env(model.env).n_agents
+    buffer: Any = model.rollout_buffer
+    if not error.tensors and getattr(buffer, "taken", None) is not None:
+        # Of a stock algorithm, whose optimizer knows no minibatch.
+        error = error.found_in(f"update {model._n_updates + 1}", buffer.named(buffer.taken))
+    message = f"after {steps} joint steps: {one_line(error)}"
+    path = run / NOT_FINITE_FILE
+    try:
+        return f"{message}; it is kept in {path}" if dump(path, error) else message
+    except OSError as failure:
+        return f"{message}; {path} could not be written: {failure.strerror or failure}"
 
 
 def _callbacks(

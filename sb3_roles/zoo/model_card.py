@@ -13,7 +13,7 @@ from typing import Any
 
 from sb3_roles.common.durations import long_duration
 from sb3_roles.common.files import open_regular
-from sb3_roles.common.safe_yaml import parse_yaml
+from sb3_roles.common.yaml_text import load_yaml
 from sb3_roles.zoo.options import UsageError
 
 CARD = "README.md"
@@ -78,17 +78,15 @@ def read_card(folder: Path) -> dict[str, Any]:
     :return: by the names in the head
     :raises CardError: if there is none, or a fact is missing
     """
-    import yaml
-
     path = folder / CARD
     try:
         with open_regular(path) as file:
             text = file.read(_MAX_BYTES).decode()
         before, head, _ = text.split(_FENCE, 2)
-        facts = parse_yaml(head)
+        facts = load_yaml(head)
     except OSError as error:
         raise CardError(f"{path}: {error.strerror or error}") from None
-    except (yaml.YAMLError, ValueError, RecursionError):
+    except ValueError:
         raise CardError(f"{path}: damaged: it has no head of data") from None
     if before or not isinstance(facts, dict):
         raise CardError(f"{path}: damaged: it has no head of data")

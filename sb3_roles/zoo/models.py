@@ -21,6 +21,7 @@ from sb3_roles.common.checkpoint import (
     read_checkpoint,
 )
 from sb3_roles.common.checkpoint_reading import Outline, read_outline
+from sb3_roles.common.not_finite import guard_optimizer
 from sb3_roles.common.role_wrapper import RoleWrapper
 from sb3_roles.common.snapshot import load_weights
 from sb3_roles.common.team_vec_env import make_team_vec_env
@@ -113,6 +114,8 @@ def make_model(
         )
     except (TypeError, ValueError, RuntimeError) as error:
         raise UsageError(f"{config['algo']}: {error}") from error
+    if not algorithm.checks_steps:
+        guard_optimizer(model.policy)
     return model
 
 

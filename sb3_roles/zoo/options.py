@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from area_search.scenes import Scene, SceneError, get_scene, unknown
+from sb3_roles.common.names import printable, shown
 
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction["Parser"]
@@ -48,7 +50,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print one line and exit."""
-        self.exit(2, f"{self.prog}: error: {' '.join(message.split())}\n")
+        self.exit(2, f"{self.prog}: error: {printable(message)}\n")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse, and refuse what is not known here: later it would be the top parser's error."""
@@ -118,7 +120,7 @@ def whole_number(low: int, high: int) -> Callable[[str], int]:
         value = int(text) if _INTEGER.fullmatch(text) else None
         if value is None or not low <= value <= high:
             raise argparse.ArgumentTypeError(
-                f"must be a whole number from {low} to {high}, got {text!r}"
+                f"must be a whole number from {low} to {high}, got {shown(text)}"
             )
         return value
 
@@ -132,7 +134,7 @@ def positive_number(high: float) -> Callable[[str], float]:
         value = float(text) if _NUMBER.fullmatch(text) else 0.0
         if not 0.0 < value <= high:
             raise argparse.ArgumentTypeError(
-                f"must be a number above 0, up to {high:g}, got {text!r}"
+                f"must be a number above 0, up to {high:g}, got {shown(text)}"
             )
         return value
 
@@ -149,15 +151,32 @@ def output_file(*endings: str) -> Callable[[str], Path]:
         file = Path(text)
         if file.suffix.lower() not in endings:
             raise argparse.ArgumentTypeError(
-                f"the file must end in {' or '.join(endings)}, got {text!r}"
+                f"the file must end in {' or '.join(endings)}, got {shown(text)}"
             )
         if file.is_dir():
-            raise argparse.ArgumentTypeError(f"{text!r} is a folder, name a file")
+            raise argparse.ArgumentTypeError(f"{shown(text)} is a folder, name a file")
         if not file.parent.is_dir():
             raise argparse.ArgumentTypeError(f"folder {str(file.parent)!r} does not exist")
         return file
 
     return path
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """Find out, before work that takes long, whether a folder can be made, or written to.
+
+    :param option: that names it
+    :param folder: it is not made
+    :raises UsageError: if it can not
+    """
+    try:
+        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    except OSError as error:
+        raise UsageError(f"argument {option}: {folder}: {error.strerror}") from None
+    if not there.is_dir():
+        raise UsageError(f"argument {option}: {there} is no folder")
+    if not os.access(there, os.W_OK):
+        raise UsageError(f"argument {option}: {str(there)!r} can not be written")
 
 
 def parse_value(text: str) -> Any:
@@ -180,12 +199,14 @@ def parse_value(text: str) -> Any:
             return _CONSTANTS[name]
     if not text.startswith(("[", "{", '"', "'")):
         return text
-    import yaml  # Few command lines need it at all.
+    # Few command lines need it at all.
+    from sb3_roles.common.yaml_text import YamlError, load_yaml
 
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ValueError(f"not valid YAML: {text!r}") from None
+        return load_yaml(text)
+    except YamlError as error:
+        why = str(error).removeprefix("line 1: ")
+        raise ValueError(f"not valid YAML: {shown(text)}: {why}") from None
 
 
 def key_value(text: str) -> tuple[str, Any]:
@@ -197,7 +218,9 @@ def key_value(text: str) -> tuple[str, Any]:
     """
     key, colon, value = text.partition(":")
     if not (colon and value and key.isidentifier()):
-        raise argparse.ArgumentTypeError(f"must be key:value, such as horizon:100, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"must be key:value, such as horizon:100, got {shown(text)}"
+        )
     try:
         return key, parse_value(value)
     except ValueError as error:

@@ -12,6 +12,7 @@ import numpy as np
 
 from area_search.batch import BatchedAreaSearch
 from area_search.render import draw_frame
+from sb3_roles.common.files import write_atomically
 from sb3_roles.evaluation.episodes import Player
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def draw_last(controller: Controller, scene: Scene, seed: int, episode: int, pat
     play_scene(controller, scene, seed, episode, frames.append, links)
     image = io.BytesIO()
     pygame.image.save(pygame.surfarray.make_surface(frames[0].swapaxes(0, 1)), image, "frame.png")
-    path.write_bytes(image.getvalue())
+    write_atomically(path, image.getvalue())
 
 
 def play_env(

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from sb3_roles.common.names import closest
+from sb3_roles.common.names import closest, shown
 
 _TEXT_NUMBER = re.compile(r"([+-]?[0-9_]*\.?[0-9]*)[eE]([+-]?)([0-9]+)")
 LINEAR = "lin_"
@@ -70,10 +70,10 @@ class Number:
             number = schedule_start(value) if self.schedule else None
             written = yaml_number(value)
             if written is not None:
-                return f"is {value!r}, which YAML reads as text: write {written}"
+                return f"is {shown(value)}, which YAML reads as text: write {written}"
         if self._fits(number):
             return None
-        return f"must be {self._describe()}, got {value!r}"
+        return f"must be {self._describe()}, got {shown(value)}"
 
     def _fits(self, number: Any) -> bool:
         kinds = int if self.whole else (int, float)
@@ -116,7 +116,7 @@ class Flag:
         """See :class:`Range`."""
         if isinstance(value, bool) or (value is None and self.optional):
             return None
-        return f"must be true or false, got {value!r}"
+        return f"must be true or false, got {shown(value)}"
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Text:
         """See :class:`Range`."""
         if isinstance(value, str) or (self.optional and value is None):
             return None
-        return f"must be a text{' or null' if self.optional else ''}, got {value!r}"
+        return f"must be a text{' or null' if self.optional else ''}, got {shown(value)}"
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Choice:
             for role, weights in value.items():
                 problem = Weights().problem(weights)
                 if problem is not None:
-                    return f"of {role!r} {problem}"
+                    return f"of {shown(role)} {problem}"
             return None
         return None if value in self.names else f"is {closest('value', value, self.names)}"
 
@@ -168,7 +168,8 @@ class Weights:
         if value is None and self.optional:
             return None
         if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
-            return f"must be weights by name, such as {{explore: 0.4, cover: 0.6}}, got {value!r}"
+            form = "weights by name, such as {explore: 0.4, cover: 0.6}"
+            return f"must be {form}, got {shown(value)}"
         for name, weight in value.items():
             problem = Number(low=-1e6, high=1e6).problem(weight)
             if problem is not None:
@@ -183,18 +184,22 @@ class Items:
     :param item: what each of its entries may be; None for texts
     :param optional: null is allowed, too
     :param least: shortest length
+    :param most: longest length; None for any
     """
 
     item: Range | None = None
     optional: bool = False
     least: int = 0
+    most: int | None = None
 
     def problem(self, value: Any) -> str | None:
         """See :class:`Range`."""
         if value is None and self.optional:
             return None
-        if isinstance(value, str) or not isinstance(value, Sequence) or len(value) < self.least:
-            return f"must be a list of at least {self.least}, got {value!r}"
+        is_list = isinstance(value, Sequence) and not isinstance(value, str)
+        if not is_list or not self.least <= len(value) <= (self.most or len(value)):
+            length = "" if self.most == self.least else "at least "
+            return f"must be a list of {length}{self.least}, got {shown(value)}"
         for entry in value:
             problem = (self.item or Text()).problem(entry)
             if problem is not None:
@@ -230,7 +235,7 @@ class Options:
     def problem(self, value: Any) -> str | None:
         """See :class:`Range`."""
         if not isinstance(value, Mapping):
-            return f"must be keys and values, got {value!r}"
+            return f"must be keys and values, got {shown(value)}"
         found = problems("", value, self.keys)
         return "; ".join(found) if found else None
 
@@ -245,7 +250,7 @@ def problems(where: str, values: Any, allowed: Mapping[str, Range]) -> list[str]
     """
     prefix = f"{where}." if where else ""
     if not isinstance(values, Mapping):
-        return [f"{where or 'the configuration'} must be a mapping of keys, got {values!r}"]
+        return [f"{where or 'the configuration'} must be a mapping of keys, got {shown(values)}"]
     found = []
     for key, value in values.items():
         if key not in allowed:

@@ -12,6 +12,8 @@ from sb3_roles.zoo.options import UsageError
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
 
+_PARQUET = b"PAR1"
+
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add the command."""
@@ -33,6 +35,7 @@ def run(args: Namespace) -> int:
     :return: exit code
     :raises UsageError: if the file holds no sound records
     """
+    _look_at(args.file)
     from sb3_roles.evaluation.records import RecordsError, read_records
     from sb3_roles.zoo.summaries import report_of, table_of
 
@@ -50,3 +53,14 @@ def run(args: Namespace) -> int:
     print(f"\n{config['controller_class']}{options}")
     print(f"config {config['config_hash'][:16]}, sb3_roles {config['version']}, {versions}")
     return 0
+
+
+def _look_at(path: Path) -> None:
+    """Refuse what is no Parquet file, before what reads one is imported."""
+    try:
+        with open(path, "rb") as file:
+            begins = file.read(len(_PARQUET))
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror or error}") from None
+    if begins != _PARQUET:
+        raise UsageError(f"{path}: damaged, or no Parquet file: it begins with {begins!r}")

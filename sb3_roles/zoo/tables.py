@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 from sb3_roles.common.files import remove_stale
 from sb3_roles.evaluation.report import PAGE
 from sb3_roles.zoo.machine import usable_cores
-from sb3_roles.zoo.options import UsageError, names_of, whole_number
+from sb3_roles.zoo.options import UsageError, check_folder, names_of, whole_number
 from sb3_roles.zoo.plans import read_plan_file
 from sb3_roles.zoo.ray_options import LOCAL, import_ray
 from sb3_roles.zoo.row_configs import LOGS, PLAN
+from sb3_roles.zoo.row_runs import named_runs
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.crews import Crew
@@ -173,6 +174,9 @@ def make(args: Namespace) -> Made | int:
     plan = read_plan(args)
     if args.figures and find_spec("matplotlib") is None:
         raise UsageError("argument --figures: install sb3_roles[plots] to draw them")
+    if args.log_folder != LOGS and not args.log_folder.is_dir():
+        raise UsageError(f"argument --log-folder: {str(args.log_folder)!r} is no folder")
+    named_runs(args.runs, plan)
     check_out(args.out, write=not args.dry_run)
     # Read when they are imported: a job is one thread.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -182,8 +186,6 @@ def make(args: Namespace) -> Made | int:
     from sb3_roles.zoo.entrants import find_entrants, make_controller, pack
     from sb3_roles.zoo.table_outputs import FIGURES, write_all
 
-    if args.log_folder != LOGS and not args.log_folder.is_dir():
-        raise UsageError(f"argument --log-folder: {str(args.log_folder)!r} is no folder")
     entrants = find_entrants(plan, args.log_folder, args.runs, tell)
     store = RecordStore(args.out / RECORDS, tell, set_aside=not args.dry_run)
     options: dict[str, Any] = {
@@ -221,13 +223,9 @@ def check_out(folder: Path, write: bool) -> None:
     :param write: make it if it is not there; otherwise it is only looked at
     :raises UsageError: if it can not
     """
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise UsageError(f"argument --out: {there} is no folder")
+    check_folder("--out", folder)
     if write:
         folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            raise UsageError(f"argument --out: {str(folder)!r} can not be written")
 
 
 def tell(line: str) -> None:

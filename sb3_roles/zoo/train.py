@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_roles.common.names import shown
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import ConfigError
 from sb3_roles.zoo.config_checks import VEC_ENVS
@@ -16,6 +17,7 @@ from sb3_roles.zoo.options import (
     DEVICES,
     MAX_TRAINING_SEED,
     KeyValues,
+    check_folder,
     int_text,
     key_value,
     one_of,
@@ -46,7 +48,7 @@ def joint_steps(text: str) -> int:
     number = value if isinstance(value, (int, float)) and not isinstance(value, bool) else 0
     if not 1 <= number <= 10**12 or number != int(number):
         raise argparse.ArgumentTypeError(
-            f"must be a whole number from 1 to {10**12} joint steps, got {text!r}"
+            f"must be a whole number from 1 to {10**12} joint steps, got {shown(text)}"
         )
     return int(number)
 
@@ -158,6 +160,7 @@ def _run(args: argparse.Namespace, stop: StopSignals) -> int:
             runs, jobs = new_jobs(given)
         for job in jobs:
             check_ray_options(job["options"], job["config"], len(jobs) > 1)
+        _check_folders(jobs[0]["options"])
     except ConfigError as error:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
@@ -176,6 +179,12 @@ def _run(args: argparse.Namespace, stop: StopSignals) -> int:
         print(f"{args.parser.prog}: error: {error}", file=sys.stderr)
         return EXIT_DIVERGED
     return 0
+
+
+def _check_folders(options: Mapping[str, Any]) -> None:
+    for name in ("log_folder", "tensorboard_log"):
+        if options[name] is not None:
+            check_folder(f"--{name.replace('_', '-')}", Path(options[name]))
 
 
 def _fan_out(

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sb3_roles.common.names import closest
+from sb3_roles.common.names import closest, shown
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import (
     ConfigError,
@@ -187,7 +187,7 @@ def resumed_job(given: Mapping[str, Any]) -> dict[str, Any]:
         whole = isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
         if not whole and not (name == "num_threads" and value is None):
             raise ConfigError(
-                [f"{path / ARGS_FILE}: {name} must be from {low} to {high}, got {value!r}"]
+                [f"{path / ARGS_FILE}: {name} must be from {low} to {high}, got {shown(value)}"]
             )
     if options["device"] not in DEVICES:
         message = closest("device", options["device"], DEVICES)

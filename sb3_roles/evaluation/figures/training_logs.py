@@ -78,18 +78,18 @@ def read_training_log(folder: Path) -> TrainingLog:
 
 
 def _scene(path: Path) -> Scene:
-    import yaml
+    from sb3_roles.common.yaml_text import load_yaml
 
     known = {field.name for field in fields(Scene)}
     try:
-        config: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        config: Any = load_yaml(path.read_text(encoding="utf-8"))
         # The environment has other arguments, too; "scene" is the name.
         options = dict(config.get("env_kwargs") or {})
         name = options.get("scene", "hard")
         return get_scene(name, **{key: options[key] for key in options if key in known - {"name"}})
     except OSError as error:
         raise TrainingLogError(f"{path}: {error.strerror}") from None
-    except (yaml.YAMLError, SceneError, AttributeError, TypeError, ValueError) as error:
+    except (SceneError, AttributeError, TypeError, ValueError) as error:
         raise TrainingLogError(f"{path}: it names no scene: {one_line(error)}") from None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from sb3_roles.common.names import closest
+from sb3_roles.common.names import closest, shown
 from sb3_roles.evaluation.grid.plan import PlanError
 
 # Of the stream of episodes; see ``held_out_seed``.
@@ -72,7 +72,7 @@ def named(what: str, content: Mapping[Any, Any]) -> dict[str, Any]:
     """
     for key in content:
         if not isinstance(key, str) or not key.replace("_", "").isalnum() or not key.isascii():
-            raise PlanError(f"{what}: names have letters, digits and _ only, got {key!r}")
+            raise PlanError(f"{what}: names have letters, digits and _ only, got {shown(key)}")
     return dict(content)
 
 
@@ -95,7 +95,7 @@ def fields(
             raise PlanError(f"{where}: {closest('key', key, checks)}")
         wanted = checks[key](value)
         if wanted is not None:
-            raise PlanError(f"{where}: {key} must be {wanted}, got {value!r}")
+            raise PlanError(f"{where}: {key} must be {wanted}, got {shown(value)}")
     for key in checks if required is None else required:
         if key not in content:
             raise PlanError(f"{where}: {key} is missing")
