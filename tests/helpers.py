@@ -22,6 +22,8 @@ from sb3_roles.common.team_vec_env import make_team_vec_env
 from sb3_roles.common.torch_layers import Head
 from sb3_roles.hmappo.policies import RoleActorCriticPolicy
 from sb3_roles.mappo.policies import TeamActorCriticPolicy
+from sb3_roles.prove.search_maps import boards as boards
+from sb3_roles.prove.search_maps import has as has
 
 # Neighbors in the order of the actions up, right, down, left.
 STEPS = ((-1, 0), (0, 1), (1, 0), (0, -1))
@@ -82,17 +84,6 @@ def hand_made(
     state["totals"][0, kernels.SEEN_FREE] = np.sum(free & (board & layout.EXPLORED > 0))
     batch.set_state(state)
     return batch
-
-
-def boards(batch: BatchedAreaSearch) -> np.ndarray:
-    """Copy the maps without their borders: uint8 (n_teams, height, width)."""
-    border = (batch.cells.shape[1] - batch.scene.height) // 2
-    return batch.cells[:, border:-border, border:-border].copy()
-
-
-def has(board: np.ndarray, bit: int) -> np.ndarray:
-    """Return where a bit is set."""
-    return (board & bit) > 0
 
 
 def reachable(free: np.ndarray) -> int:

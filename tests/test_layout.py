@@ -31,6 +31,16 @@ FORBIDDEN = {
     ),
     "sb3_roles/hmappo": ("area_search", "sb3_roles.gnn", "sb3_roles.evaluation", "sb3_roles.zoo"),
     "sb3_roles/gnn": ("sb3_roles.hmappo", "sb3_roles.evaluation", "sb3_roles.zoo"),
+    "sb3_roles/testing": (
+        "area_search",
+        "sb3_roles.mappo",
+        "sb3_roles.hmappo",
+        "sb3_roles.gnn",
+        "sb3_roles.baselines",
+        "sb3_roles.evaluation",
+        "sb3_roles.prove",
+        "sb3_roles.zoo",
+    ),
     "sb3_roles/baselines": ("sb3_roles.gnn", "sb3_roles.zoo"),
     "sb3_roles/evaluation": ("sb3_roles.gnn", "sb3_roles.zoo"),
 }
@@ -68,6 +78,11 @@ def test_dependencies_go_one_way(package: str) -> None:
         ("import area_search.scenes", ("numpy",)),
         ("from area_search import AreaSearchEnv", ("pygame", "torch", "stable_baselines3")),
         ("import sb3_roles", ("torch", "numba", "stable_baselines3")),
+        ("import sb3_roles.testing", ("torch", "numpy", "pettingzoo")),
+        (
+            "from sb3_roles.testing import check_determinism",
+            ("torch", "numba", "stable_baselines3", "pettingzoo"),
+        ),
     ],
 )
 def test_importing_brings_nothing_heavy(statement: str, absent: tuple[str, ...]) -> None:

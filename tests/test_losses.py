@@ -8,36 +8,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, lambda_returns, stream_loss
+from sb3_roles.common.losses import adapt_kl_coef, lambda_returns, stream_loss
+from sb3_roles.testing import check_returns, check_stream_loss
+from sb3_roles.testing.returns import random_rollout
 
 GAMMA = th.tensor([0.9, 0.7], dtype=th.float64)
 LAMBDA = th.tensor([0.95, 0.4], dtype=th.float64)
-
-
-def random_rollout(seed, steps=23, rows=4, streams=2):
-    """Rewards, values before each choice, the values after the last step, and episode ends."""
-    rng = np.random.default_rng(seed)
-    rewards, values = rng.normal(size=(2, steps, rows, streams))
-    ends = rng.random((steps, rows)) < 0.2
-    ends[-1, 0], ends[-1, 1] = True, False
-    return rewards, values, rng.normal(size=(rows, streams)), ends
-
-
-def forward_view(rewards, following_values, ends, gamma, lam, t):
-    """The lambda return by its definition: a weighted mean of n-step returns.
-
-    :param following_values: (T,), the value after each step
-    """
-    n_step, total, discount = [], 0.0, 1.0
-    for k in range(t, len(rewards)):
-        total += discount * rewards[k]
-        discount *= gamma
-        n_step.append(total + (0.0 if ends[k] else discount * following_values[k]))
-        if ends[k]:
-            break
-    weights = [(1 - lam) * lam**n for n in range(len(n_step) - 1)] + [lam ** (len(n_step) - 1)]
-    assert sum(weights) == pytest.approx(1.0)
-    return sum(w * g for w, g in zip(weights, n_step, strict=True))
 
 
 def compute(rollout, gamma=GAMMA, lam=LAMBDA):
@@ -47,21 +23,12 @@ def compute(rollout, gamma=GAMMA, lam=LAMBDA):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_returns_are_the_weighted_mean_of_n_step_returns_in_every_stream(seed):
-    rewards, values, last, ends = rollout = random_rollout(seed)
-    returns = compute(rollout)
-    following = np.concatenate([values[1:], last[None]])
-    for t in range(len(rewards)):
-        for row in range(rewards.shape[1]):
-            for s in range(2):
-                expected = forward_view(
-                    rewards[:, row, s],
-                    following[:, row, s],
-                    ends[:, row],
-                    float(GAMMA[s]),
-                    float(LAMBDA[s]),
-                    t,
-                )
-                assert returns[t, row, s] == pytest.approx(expected, rel=1e-12, abs=1e-12)
+    check_returns(lambda_returns, seed)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_objective_is_that_of_the_slow_reference_with_its_gradients(seed):
+    check_stream_loss(stream_loss, seed)
 
 
 def test_lambda_one_is_the_discounted_sum_and_lambda_zero_looks_one_step_ahead():
@@ -287,24 +254,3 @@ def test_the_kl_coefficient_can_come_back_from_many_timid_updates():
     for _ in range(1200):
         coefficient = adapt_kl_coef(coefficient, 0.0, 0.01)
     assert coefficient > 0.0, "it has underflowed to 0, which switches the penalty off for good"
-
-
-def test_the_losses_of_parts_add_up_to_that_of_the_whole():
-    th.manual_seed(0)
-    n, k = 12, 3
-    old, new = (th.randn(n, k).log_softmax(1) for _ in range(2))
-    rows = (th.randn(n), th.randint(0, k, (n,)), old, th.randn(n), th.randn(n), th.rand(n) < 0.6)
-
-    def loss(part: slice, *normalizers: float) -> StreamLoss:
-        values, actions, before, advantages, returns, active = (one[part] for one in rows)
-        return stream_loss(
-            *(new[part], values, actions, before, advantages, returns, active),
-            *(0.2, 0.01, 0.5, 0.3),
-            *normalizers,
-        )
-
-    whole = loss(slice(None))
-    normalizers = (float(rows[-1].sum()), n)
-    parts = [loss(slice(low, low + 4), *normalizers) for low in (0, 4, 8)]
-    for one, terms in zip(whole, zip(*parts, strict=True), strict=True):
-        th.testing.assert_close(sum(terms), one)

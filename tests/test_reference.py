@@ -5,61 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from area_search import BatchedAreaSearch, Scene
-from area_search.reference import ReferenceAreaSearch
-
-
-def assert_same(batch: BatchedAreaSearch, references: list[ReferenceAreaSearch]) -> None:
-    """Compare everything that a user can see of each team."""
-    for m, reference in enumerate(references):
-        observations = reference.observe()
-        for key, array in batch.observations.items():
-            if key in batch.team_observation_keys:
-                expected = observations[0][key]
-            else:
-                expected = np.stack([observation[key] for observation in observations])
-            assert array.dtype == expected.dtype
-            assert np.array_equal(array[m], expected), f"{key}: {array[m]} != {expected}"
-        if reference.n_steps:
-            assert np.array_equal(batch.reward_components[m], reference.reward_components())
-            assert np.array_equal(batch.rewards[m], reference.rewards())
-            metrics = batch.episode_metrics(m)
-            assert {name: metrics[name] for name in batch.metric_names} == reference.metrics()
-            assert metrics["t90_paper"] == reference.t90_paper
-            assert metrics["t90_true"] == reference.t90_true
-            assert metrics["length"] == reference.n_steps
-            assert batch.terminated[m] == reference.terminated
-            assert batch.truncated[m] == reference.truncated
+from area_search import Scene
+from sb3_roles.prove.reference_play import SideBySide
 
 
 def compare(scene: Scene, seed: int, sub_goal: str, n_teams: int, n_episodes: int) -> int:
     """Play random episodes on both; return the number of compared steps."""
-    rng = np.random.default_rng(seed)
-    time = bool(seed % 2)
-    batch = BatchedAreaSearch(scene, n_teams, sub_goal, time=time)
-    batch.reset(seed)
-    episodes = np.arange(n_teams)
-    references = [ReferenceAreaSearch(scene, seed, int(e), sub_goal, time=time) for e in episodes]
-    compared = ended = 0
-    assert_same(batch, references)
-    while ended < n_episodes * n_teams:
-        actions = rng.integers(0, 5, (n_teams, scene.n_agents))
-        roles = rng.integers(0, 3, (n_teams, scene.n_agents))
-        batch.set_roles(roles)
-        batch.step(actions)
-        for reference, moves, own in zip(references, actions, roles, strict=True):
-            reference.roles = own.tolist()
-            reference.step(moves.tolist())
-        assert_same(batch, references)
+    played = SideBySide(scene, seed, sub_goal, n_teams, time=bool(seed % 2))
+    assert not any(played.differences())
+    compared = 0
+    while played.ended < n_episodes * n_teams:
+        assert not any(found := played.step()), found
         compared += n_teams
-        done = batch.terminated | batch.truncated
-        if done.any():
-            ended += int(done.sum())
-            batch.reset_teams(done)
-            episodes[done] += n_teams
-            for m in np.flatnonzero(done):
-                episode = int(episodes[m])
-                references[m] = ReferenceAreaSearch(scene, seed, episode, sub_goal, time=time)
     return compared
 
 

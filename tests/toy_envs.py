@@ -43,6 +43,14 @@ class PlainEnv(ParallelEnv):
         return self.observe(), rewards, *flags, infos
 
 
+class HashedEnv(PlainEnv):
+    """Rewards the hash of a text, which is another one in each process."""
+
+    def step(self, actions):
+        observations, rewards, *rest = super().step(actions)
+        return observations, {agent: hash(agent) % 2**20 / 2**20 for agent in rewards}, *rest
+
+
 class WitnessEnv(PlainEnv):
     """Notes the first number that each of its episodes shows, and who was closed."""
 

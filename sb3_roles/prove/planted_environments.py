@@ -129,11 +129,16 @@ class LeftBehind(SmallSearch):
 class NoInfo(SmallSearch):
     """A robot gets no info."""
 
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Start an episode, and leave an info out."""
+        observations, infos = super().reset(seed, options)
+        del infos["robot_1"]
+        return observations, infos
+
     def step(self, actions: Mapping[str, int]) -> Any:
         """Step, and leave an info out."""
         result = super().step(actions)
-        if self.clock == _LATE:
-            del result[4]["robot_1"]
+        del result[4]["robot_1"]
         return result
 
 
@@ -156,11 +161,11 @@ class HorizonTerminates(SmallSearch):
 
 
 class SeedIgnored(SmallSearch):
-    """Every reset plays the episodes of seed 0."""
+    """A reset does not pass its seed on."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Start an episode of one and the same seed."""
-        return super().reset(None if seed is None else 0, options)
+        """Start some episode."""
+        return super().reset(None, options)
 
 
 class ActionIgnored(SmallSearch):

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from gymnasium import spaces
 
 from area_search import cells as layout
 from area_search import kernels
 from area_search.cells import N_ACTIONS
-from sb3_roles.prove.search_watch import Rule, Seen, has
+from sb3_roles.prove.search_maps import Seen, has
+
+Rule = Callable[[Seen], np.ndarray]
+"""Returns bool (n_teams,): where it holds."""
 
 _ROUNDING = 1e-6
 
@@ -19,12 +24,12 @@ def _same(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _close(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    near = np.isclose(first, second, rtol=_ROUNDING, atol=_ROUNDING)
+    near = np.asarray(np.isclose(first, second, rtol=_ROUNDING, atol=_ROUNDING))
     return np.asarray(near.reshape(len(first), -1).all(axis=1))
 
 
 def _none(wrong: np.ndarray) -> np.ndarray:
-    return ~wrong.reshape(len(wrong), -1).any(axis=1)
+    return np.asarray(~wrong.reshape(len(wrong), -1).any(axis=1))
 
 
 def _at_robots(seen: Seen, maps: np.ndarray) -> np.ndarray:
@@ -101,15 +106,8 @@ def counts(seen: Seen) -> np.ndarray:
 
 
 def finds(seen: Seen) -> np.ndarray:
-    """Each new cell and target counts for one robot: they add up to how the maps have grown."""
-    batch = seen.batch
-    kept = (
-        (batch.new_cells.sum(axis=1) == seen.grown)
-        & (batch.new_targets.sum(axis=1) == seen.found)
-        & (batch.new_cells >= 0).all(axis=1)
-        & ((batch.new_targets == 0) | (batch.new_targets == 1)).all(axis=1)
-        & _same(batch.new_targets > 0, seen.idle == 0)
-    )
+    """Each new cell and target counts for one robot, the first one in the order of indices."""
+    kept = _same(seen.batch.new_cells, seen.grown) & _same(seen.batch.new_targets, seen.found)
     return kept | ~seen.stepped
 
 
@@ -154,9 +152,7 @@ def ends(seen: Seen) -> np.ndarray:
     """An episode is truncated at the horizon, and terminated by impatience, and not otherwise."""
     batch, scene = seen.batch, seen.batch.scene
     patience = scene.early_stop_patience
-    stuck = np.zeros(len(seen.steps), bool)
-    if patience is not None:
-        stuck = (seen.idle >= patience).any(axis=1)
+    stuck = (seen.idle >= (np.inf if patience is None else patience)).any(axis=1)
     kept = (batch.truncated == (seen.steps >= scene.horizon)) & (batch.terminated == stuck)
     return (batch.steps == seen.steps) & (kept | ~seen.stepped) & (seen.steps <= scene.horizon)
 
@@ -251,8 +247,8 @@ def sub_goals(seen: Seen) -> np.ndarray:
     shown = seen.batch.observations.get("sub_goal")
     if shown is None:
         return np.ones(seen.batch.n_teams, bool)
-    first, nearness = shown[..., :2, :N_ACTIONS] > 0, shown[..., :2, N_ACTIONS]
-    kept = _same(first.any(axis=3), nearness > 0)
+    first = np.asarray(shown[..., :2, :N_ACTIONS] > 0)
+    kept = _same(np.asarray(first.any(axis=3)), shown[..., :2, N_ACTIONS] > 0)
     ground = seen.explored & ~seen.obstacle
     size = np.array(ground.shape[1:])
     for action in range(1, N_ACTIONS):

@@ -54,9 +54,9 @@ def check_batched_equals_single(
         ended = np.array([not moment.after for moment in last])
         if ended.any():
             guard("reset_teams of the batch", batch.reset_teams, ended)
-            for m in np.flatnonzero(ended):
+            for m in np.flatnonzero(ended).tolist():
                 last[m] = reset(singles[m], last[m].episode + 1)
-                _compare_observations(batch, int(m), last[m])
+                _compare_observations(batch, m, last[m])
 
 
 def _differ(m: int, agent: Any, moment: Moment, text: str) -> ConformanceError:

@@ -164,7 +164,8 @@ def _check_advantages(numbers: np.ndarray, filled: _Filled, normalized: bool) ->
         label = "scaled to mean 0 and deviation 1 over the rows in which its stream decided"
         for s in range(expected.shape[2]):
             used = expected[..., s][active[..., s]]
-            expected[..., s] = (expected[..., s] - used.mean()) / (used.std(ddof=1) + 1e-8)
+            if len(used) > 1:  # A single number has no deviation.
+                expected[..., s] = (expected[..., s] - used.mean()) / (used.std(ddof=1) + 1e-8)
     wrong = ~np.isclose(numbers[1], expected, rtol=1e-4, atol=1e-4)
     if wrong.any():
         t, row, s = (int(i) for i in np.argwhere(wrong)[0])

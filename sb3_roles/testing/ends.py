@@ -81,8 +81,8 @@ def check_agents_live_together(make_env: MakeEnv, n_steps: int = 200, seed: int 
     possible = list(env.possible_agents)
     for moment in play(env, n_steps, seed):
         for agent in possible:
-            lives, expected = agent in moment.after, bool(moment.after)
-            if lives != expected or (agent in moment.before) is False:
+            lives = agent in moment.after
+            if lives != bool(moment.after) or agent not in moment.before:
                 raise ConformanceError(
                     f"agent {agent!r}, {moment.where}: agents of a team start and end together, "
                     f"but env.agents is {list(moment.after)}"

@@ -68,7 +68,7 @@ def check_parallel_env(
     check_episode_ends(make_env, max_episode_steps, horizon, seed=seed)
     for check in (check_dtypes_and_shapes, check_finite, check_spaces, check_infos):
         check(make_env, n_steps, seed)
-    for check in (check_no_aliasing, check_determinism, check_reset_forgets):
+    for check in (check_determinism, check_no_aliasing, check_reset_forgets):
         check(make_env, n_steps, seed)
     if has_chance:
         check_seed_matters(make_env, n_steps, seed)
