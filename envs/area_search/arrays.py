@@ -13,7 +13,7 @@ from area_search import cells as layout
 from area_search import kernels, paths
 from area_search.cells import N_ACTIONS
 from area_search.rewards import MAX_ROLES, REWARD_COMPONENTS
-from area_search.scenes import Scene, unknown
+from area_search.scenes import Scene, only_scene, unknown
 from area_search.team_slices import SliceThreads, TeamSlice, check_threads, even_slices
 
 # Everything that the future of a run depends on, and what the last step reported. All else is
@@ -184,10 +184,7 @@ class TeamArrays:
 
         :raises ValueError: if they play several, see :meth:`scene_of`
         """
-        if len(self.scenes) > 1:
-            names = ", ".join(scene.name for scene in self.scenes)
-            raise ValueError(f"the teams play a mix of scenes ({names}), where one is needed")
-        return self._common
+        return only_scene(self.scenes)
 
     def scene_of(self, team: int) -> Scene:
         """Return the scene that a team plays.

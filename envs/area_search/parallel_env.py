@@ -13,7 +13,7 @@ from area_search import kernels
 from area_search.batch import BatchedAreaSearch
 from area_search.render import Window, draw_frame
 from area_search.rewards import REWARD_COMPONENTS
-from area_search.scenes import Scene, shown, unknown
+from area_search.scenes import Scene, mix_of, shown, unknown
 
 ObsDict = dict[str, dict[str, np.ndarray]]
 InfoDict = dict[str, dict[str, Any]]
@@ -132,9 +132,8 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
             mix
         """
         if len(self.scenes) > 1:
-            names = ", ".join(scene.name for scene in self.scenes)
             raise ValueError(
-                f"one team can not play a mix of scenes ({names}): take the native backend, which "
+                f"one team can not play {mix_of(self.scenes)}: take the native backend, which "
                 "plays many teams together, or one scene"
             )
         options = dict(options or {})

@@ -275,3 +275,22 @@ def get_scenes(scenes: str | Scene | Sequence[str | Scene], **options: Any) -> t
                     f"{values[1]} in {scene.name}"
                 )
     return found
+
+
+def mix_of(scenes: Sequence[Scene]) -> str:
+    """Call several scenes what messages call them, with their names.
+
+    :param scenes: of a mix
+    """
+    return f"a mix of scenes ({', '.join(scene.name for scene in scenes)})"
+
+
+def only_scene(scenes: Sequence[Scene]) -> Scene:
+    """Return what all teams play.
+
+    :param scenes: of a batch
+    :raises ValueError: if it is a mix
+    """
+    if len(scenes) > 1:
+        raise ValueError(f"the teams play {mix_of(scenes)}, where one is needed")
+    return scenes[0]

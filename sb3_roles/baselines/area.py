@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stable_baselines3.common.vec_env import VecEnv
 
-from area_search.scenes import Scene
+from area_search.scenes import Scene, only_scene
 from sb3_roles.common.team_wrapper import find_team_env
 
 
@@ -29,7 +29,4 @@ def area_scene(env: VecEnv | None) -> Scene | None:
     :raises ValueError: if its teams play several, or its rows are not those of a ``TeamVecEnv``
     """
     scenes = area_scenes(env)
-    if len(scenes) > 1:
-        names = ", ".join(scene.name for scene in scenes)
-        raise ValueError(f"the teams play a mix of scenes ({names}), where one is needed")
-    return scenes[0] if scenes else None
+    return only_scene(scenes) if scenes else None

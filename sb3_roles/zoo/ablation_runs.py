@@ -117,7 +117,7 @@ def missing_lines(variant: Variant, found: Found, logs: Path) -> list[str]:
         )
     for part in _spans(found.missing):
         s = f"s {part[0]} to {part[-1]}" if len(part) > 1 else f" {part[0]}"
-        command = training_command(variant.row, logs, part, variant.n_timesteps)
+        (command,) = commands_of(variant, logs, part)
         lines.append(f"{variant.row.name}, seed{s}: no run: {command}")
     return lines
 

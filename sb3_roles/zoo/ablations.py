@@ -13,11 +13,22 @@ from typing import TYPE_CHECKING
 
 from sb3_roles.common.files import write_atomically
 from sb3_roles.zoo.config import ConfigError, config_file, read_yaml
+from sb3_roles.zoo.grid_command import (
+    EXIT_ROWS_FAILED,
+    RECORDS,
+    add_folders,
+    add_jobs,
+    add_plan,
+    check_logs,
+    check_out,
+    exit_code,
+    said_if_stopped,
+    tell,
+)
 from sb3_roles.zoo.launcher import prepare_process
 from sb3_roles.zoo.machine import usable_cores
 from sb3_roles.zoo.options import DEVICES, UsageError, names_of, one_of, whole_number
-from sb3_roles.zoo.row_configs import ABLATIONS, LOGS, PLAN, config_of_row
-from sb3_roles.zoo.tables import EXIT_ROWS_FAILED, RECORDS, check_out, tell
+from sb3_roles.zoo.row_configs import ABLATIONS, PLAN, config_of_row
 
 if TYPE_CHECKING:
     from sb3_roles.evaluation.grid.plan import Plan
@@ -79,23 +90,8 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="NAME",
         help="of trainings: cpu, cuda or auto, which is the default",
     )
-    parser.add_argument(
-        "--jobs",
-        type=whole_number(1, 1024),
-        metavar="N",
-        help="processes that play (default: one for each CPU)",
-    )
-    parser.add_argument(
-        "-o",
-        "--out",
-        type=Path,
-        default=Path("results") / ABLATIONS,
-        metavar="DIR",
-        help="of all that is made",
-    )
-    parser.add_argument(
-        "-f", "--log-folder", type=Path, default=LOGS, metavar="DIR", help="of the runs"
-    )
+    add_jobs(parser)
+    add_folders(parser, Path("results") / ABLATIONS)
     parser.add_argument(
         "--runs",
         type=Path,
@@ -105,12 +101,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="FOLDER",
         help="further folders of runs, which are like --log-folder; nothing is trained there",
     )
-    parser.add_argument(
-        "--plan", type=Path, metavar="FILE", help=f"instead of zoo_configs/{ABLATIONS}.yml"
-    )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="only list the runs that are there and missing"
-    )
+    add_plan(parser, ABLATIONS, "only list the runs that are there and missing")
     parser.set_defaults(run=run)
 
 
@@ -137,11 +128,10 @@ def run(args: Namespace) -> int:
         raise UsageError("give --train or --dry-run, not both")
     ablations = read_ablations(args)
     jobs = args.jobs or usable_cores()
-    new = (LOGS, args.log_folder) if args.train else (LOGS,)
     for folder in (args.log_folder, *args.runs):
-        if folder not in new and not folder.is_dir():
-            option = "--log-folder" if folder == args.log_folder else "--runs"
-            raise UsageError(f"argument {option}: {str(folder)!r} is no folder")
+        first = folder == args.log_folder
+        if not (first and args.train):
+            check_logs(folder, "--log-folder" if first else "--runs")
     check_out(args.out, write=not args.dry_run)
     if args.train:
         prepare_process()
@@ -168,9 +158,7 @@ def run(args: Namespace) -> int:
     plan = ablations.plan()
     outcome = _play(args, plan, ablations, found, jobs)
     _write(args, plan, ablations, outcome)
-    if outcome.failures:
-        tell(f"left out: {', '.join(outcome.failures)}")
-    return EXIT_ROWS_FAILED if failed or outcome.failures else 0
+    return max(exit_code(outcome), EXIT_ROWS_FAILED if failed else 0)
 
 
 def read_ablations(args: Namespace) -> Ablations:
@@ -241,7 +229,7 @@ def _play(
         for name, variant in ablations.variants.items()
     }
     store = RecordStore(args.out / RECORDS, tell)
-    try:
+    with said_if_stopped(store):
         return play(
             plan,
             entrants,
@@ -253,9 +241,6 @@ def _play(
             pack=pack,
             bar=sys.stderr.isatty(),
         )
-    except KeyboardInterrupt:
-        tell(f"stopped; {store.folder} keeps what was played, and the same command goes on")
-        raise
 
 
 def _write(args: Namespace, plan: Plan, ablations: Ablations, outcome: Outcome) -> None:

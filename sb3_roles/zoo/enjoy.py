@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from area_search.scenes import mix_of
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import (
     DEVICES,
@@ -202,8 +203,7 @@ def _changed(config: Mapping[str, Any], args: Namespace) -> dict[str, Any]:
     changed = {**config, "env_kwargs": options}
     scenes = scenes_of_run(changed) if config["env"] == AREA_SEARCH else ()
     if len(scenes) > 1:
-        names = ", ".join(scene.name for scene in scenes)
-        raise UsageError(f"it was trained on a mix of scenes ({names}): add --scene NAME")
+        raise UsageError(f"it was trained on {mix_of(scenes)}: add --scene NAME")
     return changed
 
 

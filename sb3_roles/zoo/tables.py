@@ -14,11 +14,23 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_roles.common.files import remove_stale
 from sb3_roles.evaluation.report import PAGE
+from sb3_roles.zoo.grid_command import (
+    EXIT_ROWS_FAILED,
+    RECORDS,
+    add_folders,
+    add_jobs,
+    add_plan,
+    check_logs,
+    check_out,
+    exit_code,
+    said_if_stopped,
+    tell,
+)
 from sb3_roles.zoo.machine import usable_cores
-from sb3_roles.zoo.options import UsageError, check_folder, names_of, whole_number
+from sb3_roles.zoo.options import UsageError, names_of, whole_number
 from sb3_roles.zoo.plans import read_plan_file
 from sb3_roles.zoo.ray_options import LOCAL, import_ray
-from sb3_roles.zoo.row_configs import LOGS, PLAN
+from sb3_roles.zoo.row_configs import PLAN
 from sb3_roles.zoo.row_runs import named_runs
 
 if TYPE_CHECKING:
@@ -29,8 +41,6 @@ if TYPE_CHECKING:
     from sb3_roles.zoo.options import Parser, Subparsers
     from sb3_roles.zoo.table_outputs import Made
 
-EXIT_ROWS_FAILED = 3
-RECORDS = "records"
 _ABOUT = (
     "What was played once is kept in records, and only what is missing is played: a command that "
     "was interrupted goes on where it was. Learned rows are the runs of --log-folder with the "
@@ -83,23 +93,13 @@ def add_options(parser: Parser) -> None:
         "--quick", action="store_true", help="few episodes: minutes, and said in every caption"
     )
     who = parser.add_mutually_exclusive_group()
-    who.add_argument(
-        "--jobs",
-        type=whole_number(1, 1024),
-        metavar="N",
-        help="processes that play (default: one for each CPU)",
-    )
+    add_jobs(who)
     who.add_argument(
         "--ray",
         metavar="ADDRESS",
         help=f"play on a Ray cluster: its address, or {LOCAL!r} to start one here (extra ray)",
     )
-    parser.add_argument(
-        "-o", "--out", type=Path, default=Path("results"), metavar="DIR", help="of all that is made"
-    )
-    parser.add_argument(
-        "-f", "--log-folder", type=Path, default=LOGS, metavar="DIR", help="of the runs"
-    )
+    add_folders(parser, Path("results"))
     parser.add_argument(
         "--runs",
         action="append",
@@ -108,12 +108,7 @@ def add_options(parser: Parser) -> None:
         help="runs of a learned row, of its algorithm and else whatever their configuration: a run "
         "folder or a pattern; may be repeated",
     )
-    parser.add_argument(
-        "--plan", type=Path, metavar="FILE", help=f"instead of zoo_configs/{PLAN}.yml"
-    )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="only say what is there and what is missing"
-    )
+    add_plan(parser, PLAN, "only say what is there and what is missing")
 
 
 def run(args: Namespace) -> int:
@@ -174,8 +169,7 @@ def make(args: Namespace) -> Made | int:
     plan = read_plan(args)
     if args.figures and find_spec("matplotlib") is None:
         raise UsageError("argument --figures: install sb3_roles[plots] to draw them")
-    if args.log_folder != LOGS and not args.log_folder.is_dir():
-        raise UsageError(f"argument --log-folder: {str(args.log_folder)!r} is no folder")
+    check_logs(args.log_folder)
     named_runs(args.runs, plan)
     check_out(args.out, write=not args.dry_run)
     # Read when they are imported: a job is one thread.
@@ -200,40 +194,11 @@ def make(args: Namespace) -> Made | int:
         return EXIT_ROWS_FAILED if survey.failures else 0
     for folder in (args.out, args.out / FIGURES):
         remove_stale(folder)
-    try:
-        with _crew(args, store) as crew:
-            bar = sys.stderr.isatty()
-            outcome = play(
-                plan, entrants, store, make_controller, jobs, **options, crew=crew, bar=bar
-            )
-    except KeyboardInterrupt:
-        tell(f"stopped; {store.folder} keeps what was played, and the same command goes on")
-        raise
+    with said_if_stopped(store), _crew(args, store) as crew:
+        bar = sys.stderr.isatty()
+        outcome = play(plan, entrants, store, make_controller, jobs, **options, crew=crew, bar=bar)
     made = write_all(args, plan, entrants, outcome, time.time() - started, tell)
-    if outcome.failures:
-        tell(f"left out: {', '.join(outcome.failures)}")
-        return made._replace(code=EXIT_ROWS_FAILED)
-    return made
-
-
-def check_out(folder: Path, write: bool) -> None:
-    """Find out, before work that takes long, whether a folder can be written to.
-
-    :param folder: of all that is made
-    :param write: make it if it is not there; otherwise it is only looked at
-    :raises UsageError: if it can not
-    """
-    check_folder("--out", folder)
-    if write:
-        folder.mkdir(parents=True, exist_ok=True)
-
-
-def tell(line: str) -> None:
-    """Print a line on stderr, above a progress bar if there is one."""
-    from tqdm import tqdm  # type: ignore[import-untyped]
-
-    tqdm.write(line, file=sys.stderr)
-    sys.stderr.flush()
+    return made._replace(code=exit_code(outcome))
 
 
 @contextmanager
