@@ -276,7 +276,9 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
         """Check the last observations of finished episodes, which are bootstrapped with."""
         for row, info in enumerate(infos):
             last = info.get("terminal_observation")
-            for key in self._float_keys if last is not None else ():
+            if last is None:
+                continue
+            for key in self._float_keys:
                 part = last[key] if key else last
                 if not np.isfinite(part).all():
                     every = np.zeros((self.num_envs, *np.shape(part)), np.float32)
