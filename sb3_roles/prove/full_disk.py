@@ -13,6 +13,7 @@ from sb3_roles.prove.small_runs import ITERATION, small_settings
 from sb3_roles.zoo.config import write_yaml
 
 DISK_TRIALS = "sb3_roles.prove.disk_trials"
+_TIMEOUT = 3600.0
 ALGO, ENV = "hmappo", "area-search-v0"
 FILES = (
     "lock",
@@ -46,7 +47,9 @@ def offsets(setting: Setting) -> Outcome:
         "offsets": shares,
         "files": [(name, int(rng.integers(0, 4 if name == "lock" else 40))) for name in files],
     }
-    done = processes.finish(json.dumps(task), cwd=setting.folder, module=DISK_TRIALS)
+    done = processes.finish(
+        json.dumps(task), cwd=setting.folder, timeout=_TIMEOUT, module=DISK_TRIALS
+    )
     tried = n_offsets + len(files)
     if done.returncode:
         message = (done.stderr.strip().splitlines() or ["no message"])[-1]

@@ -70,16 +70,17 @@ def killed_loop(save: Callable[[int], object], delay: float) -> int:
     return done
 
 
-def own_trial(folder: Path, delay: float) -> tuple[bool, str]:
+def own_trial(folder: Path, delay: float, one_file: bool) -> tuple[bool, str]:
     """Kill a loop that saves checkpoints.
 
     :param folder: empty
     :param delay: see :func:`killed_loop`
+    :param one_file: replace a single file again and again, which has no other one to go back to
     :return: whether the kill left a partial file, and what went wrong; empty if nothing did
     """
     checkpoints = CheckpointFolder(folder)
     checkpoints.prepare()
-    done = killed_loop(lambda step: checkpoints.save(step, **content(step)), delay)
+    done = killed_loop(lambda n: checkpoints.save(1 if one_file else n, **content(n)), delay)
     partial = any(folder.glob("*.partial"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -131,7 +132,7 @@ def main(arguments: list[str]) -> None:
     for i in range(n_trials):
         own = folder / "own"
         own.mkdir()
-        partial, problem = own_trial(own, float(rng.uniform(0, _WITHIN)))
+        partial, problem = own_trial(own, float(rng.uniform(0, _WITHIN)), i % 2 == 1)
         inside += partial
         failures += [f"trial {i}: {problem}"] if problem else []
         shutil.rmtree(own)

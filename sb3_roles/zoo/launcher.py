@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
+import gc
 import os
 import platform
 
@@ -21,9 +23,11 @@ def prepare_process() -> None:
     * Of glibc: memory of tensors that are gone is kept for the next ones, instead of being given
       back to the system and taken, page by page, again. ``GLIBC_TUNABLES`` or a variable
       ``MALLOC_..._`` of the user's leaves the allocator alone.
+    * At the end the interpreter does not go through all objects of torch and numba, for a second.
     """
     if _done:
         return
+    atexit.register(gc.freeze)
     os.environ.setdefault(_PASSIVE, "PASSIVE")
     _done["malloc"] = _keep_memory()
 
