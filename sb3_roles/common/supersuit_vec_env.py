@@ -275,7 +275,7 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
     def _check_last(self, infos: list[dict[str, Any]]) -> None:
         """Check the last observations of finished episodes, which are bootstrapped with."""
         for row, info in enumerate(infos):
-            last = info.get("terminal_observation")
+            last: Any = info.get("terminal_observation")
             for key in self._float_keys if last is not None else ():
                 part = last[key] if key else last
                 if not np.isfinite(part).all():
