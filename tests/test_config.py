@@ -199,7 +199,7 @@ FILES_BY_NAME = {path.stem: path for path in FILES}
         ({"wrapper_kwargs": {"role_weights": {"explor": 1}}}, "did you mean 'explore'"),
         ({"wrapper_kwargs": {"primitive_weights": "identty"}}, "did you mean 'identity'"),
         (
-            {"wrapper_kwargs": {"primitive_weights": {"cover": {"x": 1}}}},
+            {"wrapper_kwargs": {"primitive_weights": {"explore": {}, "cover": {"x": 1}}}},
             "primitive_weights.cover: unknown reward component 'x'",
         ),
         ({"n_steps": 10, "batch_size": 1000}, "batch_size must be at most n_steps x n_envs"),
