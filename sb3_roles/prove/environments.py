@@ -125,7 +125,8 @@ def invariants(setting: Setting) -> Outcome:
         played, wrong, said = watched(part, setting.seed)
         steps, broken, lines = steps + played, broken + wrong, lines + said
         if not setting.quick and part.index % len(_VARIANTS) == 0:
-            setting.note(f"{part.scene.name}, {part.scene.n_agents} robots; {steps:,} joint steps")
+            where = f"{part.scene.name}, {part.scene.n_agents} robots"
+            setting.note(f"{where}; {steps:,} joint steps, {broken:,} with a violation")
     return Outcome(
         steps - broken,
         steps,
@@ -174,7 +175,7 @@ def reference(setting: Setting) -> Outcome:
                 differing += bool(found)
                 lines += [f"{where}, step {number}: {text}" for text in found]
         if not setting.quick:
-            setting.note(f"{where}; {steps:,} joint steps")
+            setting.note(f"{where}; {steps:,} joint steps, {differing:,} differ")
     return Outcome(
         steps - differing,
         steps,
