@@ -1,4 +1,4 @@
-"""The command line, as a user meets it: in a process of its own."""
+"""The command line, as a user meets it; in a process of its own where that is what is tested."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from sb3_roles.baselines import CONTROLLER_NAMES
+from sb3_roles.zoo import bench_env, env_cases, machine
 from sb3_roles.zoo.bench_env import case_name
 from sb3_roles.zoo.bench_report import log_log_slope
 from sb3_roles.zoo.options import key_value, parse_value
@@ -31,21 +32,29 @@ def sb3_roles(*args: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def simulate_json(*args: str) -> dict:
-    result = sb3_roles("simulate", "--json", *args)
-    assert result.returncode == 0, result.stderr
-    assert result.stderr == ""
-    return json.loads(result.stdout)
+@pytest.fixture
+def printed(tell):
+    """Run a command in this process; what it prints."""
+
+    def run(*args: str) -> str:
+        code, out, err = tell(*args)
+        assert (code, err) == (0, "")
+        return out
+
+    return run
 
 
 @pytest.mark.parametrize(
     "args", [["--help"], ["simulate", "--help"], ["bench", "--help"], ["bench", "env", "--help"]]
 )
-def test_help(args):
-    result = sb3_roles(*args)
-    assert result.returncode == 0
-    assert result.stdout.startswith("usage: sb3-roles")
-    assert result.stderr == ""
+def test_help(printed, args):
+    assert printed(*args).startswith("usage: sb3-roles")
+
+
+def test_a_process_prints_the_same(tell):
+    for args in (["simulate", "--help"], ["simulate", "--episodes", "9" * 5000]):
+        result = sb3_roles(*args)
+        assert (result.returncode, result.stdout, result.stderr) == tell(*args)
 
 
 WRONG = [
@@ -81,9 +90,9 @@ WRONG = [
     (["simulate", "--controller", "random,"], "sb3-roles simulate: error", "controller ''"),
     (["simulate", "--stream", "training"], "sb3-roles simulate: error", "held_out, raw"),
     (["simulate", "--out", "x.csv"], "sb3-roles simulate: error", ".parquet"),
-    (["simulate", "--out", "/nowhere/x.parquet"], "sb3-roles simulate: error", "'/nowhere'"),
+    (["simulate", "--out", "nowhere/x.parquet"], "sb3-roles simulate: error", "'nowhere'"),
     (["simulate", "--render", "x.bmp"], "sb3-roles simulate: error", ".png"),
-    (["simulate", "--render", "/nowhere/x.png"], "sb3-roles simulate: error", "'/nowhere'"),
+    (["simulate", "--render", "nowhere/x.png"], "sb3-roles simulate: error", "'nowhere'"),
     (["bench", "evn"], "sb3-roles bench: error", "did you mean 'env'?"),
     (["bench", "env", "--seconds-per-case", "0"], "sb3-roles bench env: error", "above 0"),
     (["bench", "env", "--seconds-per-case", "inf"], "sb3-roles bench env: error", "'inf'"),
@@ -92,13 +101,13 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("args", "start", "part"), WRONG)
-def test_wrong_command_line(args, start, part):
-    result = sb3_roles(*args)
-    assert result.returncode == 2
-    assert result.stdout == ""
-    assert result.stderr.startswith(start)
-    assert part in result.stderr
-    assert result.stderr.count("\n") == 1
+def test_wrong_command_line(tell, args, start, part):
+    code, out, err = tell(*args)
+    assert code == 2
+    assert out == ""
+    assert err.startswith(start)
+    assert part in err
+    assert err.count("\n") == 1
 
 
 def test_nothing_heavy_is_imported_before_the_arguments_are_right():
@@ -117,11 +126,10 @@ def test_nothing_heavy_is_imported_before_the_arguments_are_right():
 
 
 @pytest.mark.parametrize("controller", [n for n in CONTROLLER_NAMES if n not in SLOW])
-def test_simulate_json(controller):
-    report = simulate_json(
-        *("--controller", controller, "--scene", "easy", "--n-agents", "3", "--episodes", "30"),
-        *("--seed", "5", "--scene-options", "horizon:20", "free_fraction:0.7"),
-    )
+def test_simulate_json(printed, controller):
+    args = ("simulate", "--json", "--controller", controller, "--scene", "easy")
+    args += ("--n-agents", "3", "--episodes", "30", "--seed", "5")
+    report = json.loads(printed(*args, "--scene-options", "horizon:20", "free_fraction:0.7"))
     config = report["config"]
     assert config["controller"] == controller
     assert (config["episodes"], config["seed"], config["first_episode"]) == (30, 5, 0)
@@ -150,10 +158,10 @@ def test_simulate_json(controller):
     assert timing["episodes_per_second"] > 0
 
 
-def test_batch_size_changes_no_metric():
-    args = ("--episodes", "40", "--scene-options", "horizon:15")
-    one = simulate_json(*args, "--batch-size", "1")
-    many = simulate_json(*args, "--batch-size", "500")
+def test_batch_size_changes_no_metric(printed):
+    args = ("simulate", "--json", "--episodes", "40", "--scene-options", "horizon:15")
+    one = json.loads(printed(*args, "--batch-size", "1"))
+    many = json.loads(printed(*args, "--batch-size", "500"))
     assert one["metrics"] == many["metrics"]
 
 
@@ -189,20 +197,6 @@ def trained(tmp_path_factory) -> Path:
     write_yaml(run / "config.yml", config)
     CheckpointFolder(run / CHECKPOINTS).prepare()
     CheckpointFolder(run / CHECKPOINTS).save(0, manifest={}, policy=model.policy.state_dict())
-    return run
-
-
-@pytest.fixture
-def printed(capsys):
-    """Run a command in this process; what it prints."""
-    from sb3_roles.zoo.cli import main
-
-    def run(*args: str) -> str:
-        assert main(args) == 0
-        captured = capsys.readouterr()
-        assert captured.err == ""
-        return captured.out
-
     return run
 
 
@@ -264,9 +258,7 @@ def test_records_prints_what_simulate_printed(tmp_path, printed):
     assert simulated["config"]["config_hash"][:16] in table
 
 
-def test_wrong_evaluations(trained, tmp_path, capsys):
-    from sb3_roles.zoo.cli import main
-
+def test_wrong_evaluations(trained, tmp_path, tell):
     broken = tmp_path / "broken.parquet"
     broken.write_bytes(b"PAR1")
     run = str(trained)
@@ -283,14 +275,11 @@ def test_wrong_evaluations(trained, tmp_path, capsys):
         (["records", str(tmp_path / "none.parquet")], "No such file"),
         (["records"], "FILE"),
     ]:
-        with pytest.raises(SystemExit) as end:
-            main(args)
-        assert end.value.code == 2
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.startswith(f"sb3-roles {args[0]}: error: ")
-        assert part in captured.err, captured.err
-        assert captured.err.count("\n") == 1
+        code, out, err = tell(*args)
+        assert (code, out) == (2, "")
+        assert err.startswith(f"sb3-roles {args[0]}: error: ")
+        assert part in err, err
+        assert err.count("\n") == 1
 
 
 def test_closed_pipe_ends_quietly():
@@ -380,10 +369,28 @@ def test_log_log_slope_of_a_power_law():
     assert log_log_slope(sizes, [3 * size**1.5 for size in sizes]) == pytest.approx(1.5)
 
 
-def test_bench_env_measures_everything():
-    result = sb3_roles("bench", "env", "--json", "--seconds-per-case", "0.001", "--repeats", "2")
-    assert result.returncode == 0, result.stderr
-    report = json.loads(result.stdout)
+@pytest.fixture
+def brief(monkeypatch):
+    """Let ``bench env`` prepare few teams and short episodes, and compile nothing anew."""
+    make_scene, empty = env_cases.make_scene, []
+
+    def fresh_python(code: str, **variables: str) -> list[float]:
+        empty.extend(not any(Path(folder).iterdir()) for folder in variables.values())
+        return machine.fresh_python(code)
+
+    monkeypatch.setattr(env_cases, "N_TEAMS", 32)
+    monkeypatch.setattr(env_cases, "N_TEAMS_ROUTES", 4)
+    monkeypatch.setattr(
+        env_cases, "make_scene", lambda *size: make_scene(*size).with_options(horizon=10)
+    )
+    monkeypatch.setattr(bench_env, "fresh_python", fresh_python)
+    yield
+    assert empty == [True]  # The cache of what would have been compiled.
+
+
+def test_bench_env_measures_everything(printed, brief):
+    args = ("bench", "env", "--json", "--seconds-per-case", "0.001", "--repeats", "2")
+    report = json.loads(printed(*args))
     assert report["config"] == {"seconds_per_case": 0.001, "repeats": 2}
     assert set(report["machine"]) >= {"cpu", "cores", "load_before", "python", "numpy", "numba"}
     cases = {case["name"]: case for case in report["cases"]}
