@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -156,7 +156,7 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
         logger = _logger(run, log, config, options)
         stack.callback(logger.close)
         model.set_logger(logger)
-        callbacks = _callbacks(run, model, config, options, stack)
+        callbacks = run_callbacks(run, model, config, options, stack)
         _print_start(run, model, config, None if resume is None else begun)
         if get_algorithm(config["algo"]).clones:
             _get_demonstrations(run, model, job)
@@ -176,8 +176,7 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
                     checkpoints,
                     stop,
                     [*callbacks, *bar],
-                    # An algorithm may know more than weights and counters.
-                    stateful=[log, *callbacks, *([model] if hasattr(model, "get_state") else [])],
+                    stateful=with_state(log, callbacks, model),
                     config=config,
                     resume=resume,
                     save_freq=options["save_freq"],
@@ -208,13 +207,21 @@ def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> in
     return 0
 
 
-def _callbacks(
+def run_callbacks(
     run: Path,
     model: OnPolicyAlgorithm,
     config: Mapping[str, Any],
     options: Mapping[str, Any],
     stack: ExitStack,
 ) -> list[Any]:
+    """Make the callbacks of a run.
+
+    :param run: folder of what they write
+    :param model: to be trained
+    :param config: checked
+    :param options: ``eval_freq``, ``eval_episodes`` and ``verbose``
+    :param stack: closes what they have open
+    """
     window = model._stats_window_size
     callbacks: list[Any] = [TeamMetricsCallback(window)]
     if get_algorithm(config["algo"]).wrapper == "role":
@@ -232,6 +239,16 @@ def _callbacks(
         stack.callback(evaluation.close)
         callbacks.append(evaluation)
     return callbacks
+
+
+def with_state(log: CsvLog, callbacks: Sequence[Any], model: OnPolicyAlgorithm) -> list[Any]:
+    """Return what a checkpoint keeps the state of, beside the model's weights and counters.
+
+    :param log: the run's
+    :param callbacks: of :func:`run_callbacks`
+    :param model: an algorithm may know more than weights and counters
+    """
+    return [log, *callbacks, *([model] if hasattr(model, "get_state") else [])]
 
 
 def _read_newest(
