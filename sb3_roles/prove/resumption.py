@@ -38,10 +38,12 @@ from sb3_roles.zoo.run_folder import CHECKPOINTS
 N_ITERATIONS = 8
 CUTS = tuple(range(1, N_ITERATIONS))
 """Iterations after which a run is cut."""
-_QUICK_CUTS = (2, 5)
-_QUICK_ITERATIONS = 6
-_QUICK = ("hmappo", "gnn", "recurrent_ppo")
+_QUICK_CUTS = (1, 3)
+_QUICK_ITERATIONS = 4
+_QUICK = ("gnn", "recurrent_ppo")
 _THREADS = (1, 2)
+# Two updates an epoch: more of them cost time and resume no other way.
+_BATCH = {"batch_size": ITERATION // 2}
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ class Case:
         :param n_iterations: of the whole run
         :param seed: of the run
         """
-        changes = dict(self.changes)
+        batch = _BATCH if "batch_size" in ALGORITHMS[self.algo].parameters else {}
+        changes = {**batch, **self.changes}
         if self.precision:
             own = SMALL_POLICIES[next(iter(ALGORITHMS[self.algo].policies))]
             given = changes.get("policy_kwargs", own)
@@ -95,7 +98,7 @@ def precisions(algo: str) -> tuple[str, ...]:
 def of_defaults() -> dict[str, Any]:
     """Return the keys of HMAPPO's own configuration, with sub-goals by routes, in small."""
     settings = load_settings("hmappo", AREA_SEARCH)
-    small = {"n_envs": TEAMS, "n_steps": STEPS, "batch_size": 8, "n_timesteps": None}
+    small = {"n_envs": TEAMS, "n_steps": STEPS, **_BATCH}
     changed = merge(settings, {**small, "env_kwargs": SMALL_SCENE})
     # The length of the run is the experiment's.
     return {key: value for key, value in changed.items() if key not in ("n_timesteps", "policy")}
