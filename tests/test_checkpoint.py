@@ -21,7 +21,7 @@ from sb3_roles.common.checkpoint import (
     write_checkpoint,
 )
 from sb3_roles.common.env_state import env_gap
-from sb3_roles.common.snapshot import differences, load_weights, machine_facts
+from sb3_roles.common.snapshot import load_weights
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.prove.small_runs import SMALL_POLICIES, small_run
 from sb3_roles.prove.training_runs import (
@@ -162,14 +162,6 @@ def test_records_of_an_episode_that_was_cut_off_are_dropped(tmp_path, algo):
         # Two robots have a role in each of the 5 steps.
         assert (roles["window_counts"].sum(axis=2) == 2).all()
         assert roles["window_counts"].shape[1] == 5
-
-
-def test_differences_name_what_changed():
-    facts = machine_facts(th.device("cpu"))
-    assert differences(facts, facts) == []
-    assert differences({**facts, "threads": 99}, facts) == [
-        f"threads was 99, is {facts['threads']}"
-    ]
 
 
 @pytest.fixture

@@ -113,9 +113,7 @@ def all_cases() -> list[Case]:
         for precision in precisions(algo)
     ]
     # What plays but does not learn from it is the same on any backend.
-    cases += [
-        Case(name, backend="supersuit") for name, one in ALGORITHMS.items() if not one.clones
-    ]
+    cases += [Case(name, backend="supersuit") for name, one in ALGORITHMS.items() if not one.clones]
     mix = {**SMALL_SCENE, "scene": ["easy", "hard"], "sub_goal": "assigned"}
     sticky = {"role_every": 3, "role_control": "learned"}
     return [

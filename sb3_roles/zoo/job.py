@@ -20,10 +20,10 @@ from stable_baselines3.common.logger import (
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_roles.common import snapshot
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
 from sb3_roles.common.env_state import env_gap
+from sb3_roles.common.facts import differences, machine_facts
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
 from sb3_roles.common.progress_callback import TeamProgressBar
@@ -36,7 +36,7 @@ from sb3_roles.evaluation.evaluators import (
     scenes_evaluator,
 )
 from sb3_roles.zoo.algorithms import get_algorithm
-from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
+from sb3_roles.zoo.config import CONFIG_FILE, plain, write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
 from sb3_roles.zoo.models import check_device, complete, make_env, make_model, steps_of
@@ -83,6 +83,10 @@ def run_job(job: Mapping[str, Any]) -> int:
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
+        if options.get("strict_resume"):
+            # Before anything in the folder is touched, even its lock.
+            folder = CheckpointFolder(Path(job["resume"]) / CHECKPOINTS)
+            _note_inexact(_read_newest(folder, model, complete(config))[2], job)
         with rollouts_on_ray(model, config, options):
             run, lock = _open_run(job)
             try:
@@ -140,12 +144,13 @@ def _command(job: Mapping[str, Any]) -> list[str]:
 
 
 def _train_in(run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any]) -> int:
-    config, options = job["config"], job["options"]
+    config, options = complete(job["config"]), job["options"]
     checkpoints = CheckpointFolder(run / CHECKPOINTS)
     checkpoints.prepare()
     resume, begun = None, 0
     if job["resume"] is not None:
-        resume, begun = _read_newest(checkpoints, model, config)
+        resume, begun, reasons = _read_newest(checkpoints, model, config)
+        _note_inexact(reasons, job)
         if options.get("n_timesteps", begun) < begun:
             wanted = options["n_timesteps"]
             raise UsageError(f"{run} has {begun} joint steps already, more than -n {wanted}")
@@ -253,10 +258,10 @@ def with_state(log: CsvLog, callbacks: Sequence[Any], model: OnPolicyAlgorithm) 
 
 def _read_newest(
     checkpoints: CheckpointFolder, model: OnPolicyAlgorithm, config: Mapping[str, Any]
-) -> tuple[Checkpoint, int]:
-    """Read where a run was, and say what may keep it from going on bit for bit.
+) -> tuple[Checkpoint, int, list[str]]:
+    """Read where a run was; nothing is written.
 
-    :return: the checkpoint and its joint steps
+    :return: the checkpoint, its joint steps, and what may keep it from going on bit for bit
     """
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -269,16 +274,21 @@ def _read_newest(
         print(f"warning: {warning.message}", flush=True)
     assert model.env is not None
     machine, trained = (checkpoint.manifest.get(name) for name in ("machine", "config"))
-    saved = machine if isinstance(machine, dict) else {}
-    reasons = snapshot.differences(saved, snapshot.machine_facts(model.device))
+    reasons = differences(machine if isinstance(machine, dict) else {}, machine_facts(model))
     gap = env_gap(model.env)
     reasons += [] if gap is None else [gap]
-    before = trained.get("n_timesteps") if isinstance(trained, dict) else None
-    if before != config["n_timesteps"]:
-        reasons.append(f"n_timesteps was {before}, is {config['n_timesteps']}")
-    if reasons:
-        print(f"not bit-exact: {'; '.join(reasons)}", flush=True)
-    return checkpoint, begun
+    reasons += differences(trained if isinstance(trained, dict) else {}, plain(config))
+    return checkpoint, begun, [one_line(reason) for reason in reasons]
+
+
+def _note_inexact(reasons: Sequence[str], job: Mapping[str, Any]) -> None:
+    """Say, or refuse, what may keep a run from going on bit for bit."""
+    if not reasons:
+        return
+    text = f"not bit-exact: {'; '.join(reasons)}"
+    if job["options"].get("strict_resume"):
+        raise UsageError(f"--strict-resume: {job['resume']}: {text}")
+    print(text, flush=True)
 
 
 def _logger(

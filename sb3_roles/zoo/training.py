@@ -18,6 +18,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+from sb3_roles.common.facts import machine_facts
 from sb3_roles.common.files import csv_bytes, write_atomically
 from sb3_roles.common.team_wrapper import find_team_env
 
@@ -173,7 +174,7 @@ def train(
         env_steps = model.num_timesteps // n_agents
         manifest = {
             "config": dict(config or {}),
-            "machine": snapshot.machine_facts(model.device),
+            "machine": machine_facts(model),
             "env_steps": env_steps,
             "agent_steps": model.num_timesteps,
         }
