@@ -14,13 +14,10 @@ import numpy as np
 
 from sb3_roles.prove.processes import environment
 from sb3_roles.prove.promises import Outcome, Setting
-from sb3_roles.prove.remains import (
-    first_odd,
-    remains_of_run,
-    remains_of_tables,
-)
+from sb3_roles.prove.remains import first_odd, remains_of_run, remains_of_tables
 from sb3_roles.prove.small_runs import small_settings
 from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ray_options import import_ray
 from sb3_roles.zoo.run_folder import find_run
 
@@ -99,11 +96,21 @@ def commands(algos: list[str]) -> None:
         digests |= {
             f"{algo}: {name}": one for name, one in remains_of_run(_run_of(here, algo)).items()
         }
-    write_yaml(here / _PLAN, tiny_plan())
-    run = _run_of(here, "hmappo")
-    _call(main, "tables", "--plan", _PLAN, "-o", _TABLES, "--jobs", "1", "--runs", f"learned={run}")
-    digests |= remains_of_tables(here / _TABLES)
+    digests |= evaluated(here)
     (here / "remains.json").write_text(json.dumps(digests))
+
+
+def evaluated(here: Path) -> dict[str, str]:
+    """Make tables of a run in a folder, and return digests of them.
+
+    :param here: with a run of HMAPPO
+    """
+    from sb3_roles.zoo.cli import main
+
+    write_yaml(here / _PLAN, tiny_plan())
+    out, learned = here / _TABLES, f"learned={_run_of(here, 'hmappo')}"
+    _call(main, "tables", "--plan", _PLAN, "-o", str(out), "--jobs", "1", "--runs", learned)
+    return remains_of_tables(out)
 
 
 def _run_of(folder: Path, algo: str) -> Path:
@@ -146,8 +153,6 @@ def ray(setting: Setting) -> Outcome:
 
     :param setting: see :class:`Setting`
     """
-    from sb3_roles.zoo.options import UsageError
-
     try:
         import_ray()
     except UsageError as error:
@@ -156,7 +161,7 @@ def ray(setting: Setting) -> Outcome:
 
     before = os.environ.get("PYTHONPATH")
     # Workers find the packages of this process.
-    os.environ.update(environment())
+    os.environ["PYTHONPATH"] = environment()["PYTHONPATH"]
     try:
         trials = training_trials(setting)
         if not setting.quick:
@@ -168,6 +173,5 @@ def ray(setting: Setting) -> Outcome:
             os.environ["PYTHONPATH"] = before
     failures = [f"{trial.name}: {trial.odd}" for trial in trials if trial.odd]
     said = "; ".join(f"{trial.name}, {trial.deaths} killed" for trial in trials)
-    return Outcome(
-        len(trials) - len(failures), len(trials), f"identical without Ray: {said}", tuple(failures)
-    )
+    held = len(trials) - len(failures)
+    return Outcome(held, len(trials), f"as without Ray: {said}", tuple(failures))

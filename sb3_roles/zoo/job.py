@@ -278,7 +278,7 @@ def _read_newest(
     gap = env_gap(model.env)
     reasons += [] if gap is None else [gap]
     reasons += differences(trained if isinstance(trained, dict) else {}, plain(config))
-    return checkpoint, begun, [one_line(reason) for reason in reasons]
+    return checkpoint, begun, [" ".join(reason.split()) for reason in reasons]
 
 
 def _note_inexact(reasons: Sequence[str], job: Mapping[str, Any]) -> None:
