@@ -5,19 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import random
 import shutil
 import zipfile
 
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.logger import Logger
 from toy_envs import PlainEnv, WitnessEnv
 
 from sb3_roles.common import checkpoint, stored_zip
 from sb3_roles.common import checkpoint_reading as ckpt
-from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import (
     CheckpointError,
     CheckpointFolder,
@@ -25,16 +22,20 @@ from sb3_roles.common.checkpoint import (
     write_checkpoint,
 )
 from sb3_roles.common.env_state import env_gap
-from sb3_roles.common.snapshot import differences, load_weights, machine_facts
+from sb3_roles.common.snapshot import load_weights
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.prove.small_runs import SMALL_POLICIES, small_run
-from sb3_roles.zoo.algorithms import ALGORITHMS
+from sb3_roles.prove.training_runs import (
+    EVALUATED,
+    NOT_EVALUATED,
+    checkpoint_difference,
+    difference,
+    log_difference,
+    train_here,
+)
 from sb3_roles.zoo.config import write_yaml
-from sb3_roles.zoo.job import make_evaluate
 from sb3_roles.zoo.models import complete, load_model, make_env, make_model
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.stop_signals import StopSignals
-from sb3_roles.zoo.training import CsvLog, train
 
 # 4 teams x 8 steps = 32 joint steps an iteration.
 N, CUT = 96, 32
@@ -48,68 +49,14 @@ def few_threads():
     th.set_num_threads(before)
 
 
-def run(folder, config, resume=None, stop_at=None, evaluate=True):
+def run(folder, config, resume=False, stop_at=None, evaluate=True):
     """Train in this process; return the model and the newest checkpoint."""
-    folder.mkdir(exist_ok=True)
-    # What another process would start with.
-    th.manual_seed(99)
-    random.seed(99)
-    env = make_env(config)
-    model = make_model(config, env, "cpu")
-    log = CsvLog(folder / "progress.csv")
-    model.set_logger(Logger(str(folder), [log]))
-    callbacks = [TeamMetricsCallback(window=10)]
-    if ALGORITHMS[config["algo"]].wrapper == "role":
-        callbacks.append(RoleCallback(window=10))
-    if evaluate:
-        callbacks.append(EvaluationCallback(40, evaluate=make_evaluate(config, 2, 0)))
-    checkpoints = CheckpointFolder(folder / "checkpoints")
-    checkpoints.prepare()
-    before = checkpoints.newest()[1] if resume else None
-    train(
-        model,
-        config["n_timesteps"],
-        checkpoints,
-        StopSignals(),
-        callbacks,
-        [log, *callbacks],
-        config,
-        resume=before,
-        stop_at=stop_at,
-    )
-    env.close()
-    return model, checkpoints.newest()[1]
-
-
-def without_times(state):
-    return {key: value for key, value in state.items() if key != "elapsed_ns"}
+    options = EVALUATED if evaluate else NOT_EVALUATED
+    return train_here(folder, config, resume, stop_at, options=options)
 
 
 def assert_same(a, b, where="state"):
-    assert type(a) is type(b), where
-    if isinstance(a, dict):
-        assert set(a) == set(b), where
-        for key in a:
-            assert_same(a[key], b[key], f"{where}/{key}")
-    elif isinstance(a, list):
-        assert len(a) == len(b), where
-        for i, (x, y) in enumerate(zip(a, b, strict=True)):
-            assert_same(x, y, f"{where}/{i}")
-    elif isinstance(a, (np.ndarray, th.Tensor)):
-        assert a.dtype == b.dtype, where
-        assert a.shape == b.shape, where
-        if isinstance(a, th.Tensor):
-            assert th.equal(a, b), where
-        else:
-            assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), where
-    else:
-        assert a == b or (a != a and b != b), where
-
-
-def untimed_rows(path):
-    rows = [line.split(",") for line in path.read_text().splitlines()]
-    timed = [i for i, name in enumerate(rows[0]) if name in ("time/fps", "time/time_elapsed")]
-    return [[cell for i, cell in enumerate(row) if i not in timed] for row in rows]
+    assert difference(a, b, where) is None
 
 
 EXACT = [
@@ -143,8 +90,6 @@ EXACT = [
 @pytest.mark.parametrize(("algo", "backend", "changes"), EXACT)
 def test_resumed_training_equals_straight_training(tmp_path, algo, backend, changes):
     config = small_run(algo, backend, **changes)
-    (tmp_path / "straight").mkdir()
-    (tmp_path / "cut").mkdir()
     _, straight = run(tmp_path / "straight", config)
     run(tmp_path / "cut", config, stop_at=CUT)
     # What was logged after the checkpoint, before the process died, must not stay.
@@ -153,17 +98,12 @@ def test_resumed_training_equals_straight_training(tmp_path, algo, backend, chan
     _, resumed = run(tmp_path / "cut", config, resume=True)
     assert straight.manifest["env_steps"] == resumed.manifest["env_steps"] == N
     assert straight.optimizer
-    assert_same(straight.policy, resumed.policy, "policy")
-    assert_same(straight.optimizer, resumed.optimizer, "optimizer")
-    assert_same(without_times(straight.state), without_times(resumed.state))
-    assert untimed_rows(tmp_path / "straight/progress.csv") == untimed_rows(
-        tmp_path / "cut/progress.csv"
-    )
+    assert checkpoint_difference(straight, resumed) is None
+    assert log_difference(tmp_path / "straight", tmp_path / "cut") is None
 
 
 def test_two_runs_differ_only_by_seed(tmp_path):
     _, first = run(tmp_path, small_run("mappo"), stop_at=32)
-    (tmp_path / "other").mkdir()
     _, other = run(tmp_path / "other", {**small_run("mappo"), "seed": 4}, stop_at=32)
     assert any(not th.equal(first.policy[k], other.policy[k]) for k in first.policy)
 
@@ -223,14 +163,6 @@ def test_records_of_an_episode_that_was_cut_off_are_dropped(tmp_path, algo):
         # Two robots have a role in each of the 5 steps.
         assert (roles["window_counts"].sum(axis=2) == 2).all()
         assert roles["window_counts"].shape[1] == 5
-
-
-def test_differences_name_what_changed():
-    facts = machine_facts(th.device("cpu"))
-    assert differences(facts, facts) == []
-    assert differences({**facts, "threads": 99}, facts) == [
-        f"threads was 99, is {facts['threads']}"
-    ]
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ optimizer, logs and environments as training that was never stopped.
 from __future__ import annotations
 
 import copy
-import platform
 import random
 import time
 from collections import deque
@@ -17,12 +16,10 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import stable_baselines3
 import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_roles._version import __version__
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError
 from sb3_roles.common.checkpoint_fit import (
     check_like,
@@ -35,33 +32,6 @@ from sb3_roles.common.env_state import env_state, laid_out_like, set_env_state
 from sb3_roles.common.team_wrapper import find_team_env
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
-
-
-def machine_facts(device: th.device) -> dict[str, Any]:
-    """Return what bit-exactness depends on beyond a run's own state."""
-    facts = {
-        "sb3_roles": __version__,
-        "torch": th.__version__,
-        "numpy": np.__version__,
-        "stable_baselines3": stable_baselines3.__version__,
-        "python": platform.python_version(),
-        "device": device.type,
-        "threads": th.get_num_threads(),
-        "cpu_capability": th.backends.cpu.get_cpu_capability(),
-        "dtype": str(th.get_default_dtype()),
-    }
-    if device.type == "cuda":
-        facts["gpu"] = th.cuda.get_device_name(device)
-    return facts
-
-
-def differences(saved: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return what keeps a run on another machine from being bit-exact, one text each."""
-    return [
-        f"{name} was {saved.get(name)}, is {now.get(name)}"
-        for name in {**saved, **now}
-        if saved.get(name) != now.get(name)
-    ]
 
 
 def _begin_anew(model: OnPolicyAlgorithm, env: VecEnv) -> None:

@@ -11,12 +11,8 @@ SMALL_SCENE = {"height": 9, "width": 9, "n_targets": 8, "n_agents": 3, "horizon"
 TEAMS, STEPS = 4, 8
 ITERATION = TEAMS * STEPS
 """Joint steps of an iteration."""
-_MAPS = {
-    "local_channels": [2, 2, 2],
-    "joint_channels": [2, 2, 2, 2],
-    "state_channels": [2, 2, 2],
-    "graph_width": 8,
-}
+_STATE = {"local_channels": [2, 2, 2], "state_channels": [2, 2, 2]}
+_MAPS = {**_STATE, "joint_channels": [2, 2, 2, 2], "graph_width": 8}
 SMALL_POLICIES: dict[str, dict[str, Any]] = {
     "TeamPolicy": {**_MAPS, "actor_arch": [8], "head_arch": [8], "value_arch": [8]},
     "RolePolicy": {
@@ -26,10 +22,22 @@ SMALL_POLICIES: dict[str, dict[str, Any]] = {
         "primitive_arch": [8],
         "value_arch": [8],
     },
+    "GNNPolicy": {**_STATE, "n_hops": 4, "hop_width": 8, "value_arch": [8]},
+    "H2GNNPolicy": {**_STATE, "n_hops": 2, "hop_width": 8, "value_arch": [8]},
     "RowPolicy": {"net_arch": [8]},
     "RecurrentRowPolicy": {"net_arch": [8], "lstm_hidden_size": 8},
 }
-_SMALL_UPDATES = {"batch_size": 8, "n_epochs": 2, "cg_max_steps": 3, "n_critic_updates": 2}
+_SMALL_UPDATES = {
+    "batch_size": 8,
+    "n_epochs": 2,
+    "cg_max_steps": 3,
+    "n_critic_updates": 2,
+    "controller": "greedy_assigned",
+    "n_demonstrations": 4,
+    "patience": None,
+}
+# Policies of the graph of known cells, which is observed on demand.
+_GRAPHS = ("GNNPolicy", "H2GNNPolicy")
 
 
 def small_settings(
@@ -37,20 +45,26 @@ def small_settings(
 ) -> dict[str, Any]:
     """Return the keys of a configuration file for a run of seconds.
 
-    :param algo: of the registry, one that collects rollouts
+    :param algo: of the registry; one that clones records its demonstrations first
     :param n_iterations: iterations of the whole run
     :param env: ``area-search-v0``, or ``module:factory``
     :param changes: keys to replace
     """
     algorithm = ALGORITHMS[algo]
-    of_search = env == "area-search-v0"
+    policy = next(iter(algorithm.policies))
+    env_kwargs: dict[str, Any] = {}
+    if env == "area-search-v0":
+        seen = {"known_map": True} if policy in _GRAPHS else {"sub_goal": "nearest"}
+        env_kwargs = {**SMALL_SCENE, **seen}
     return {
         "n_timesteps": n_iterations * ITERATION,
         "n_envs": TEAMS,
-        "env_kwargs": {**SMALL_SCENE, "sub_goal": "nearest"} if of_search else {},
-        "policy_kwargs": SMALL_POLICIES[next(iter(algorithm.policies))],
-        "learning_rate": "lin_1.0e-3",
+        "env_kwargs": env_kwargs,
+        "policy_kwargs": SMALL_POLICIES[policy],
+        # Of cloning it falls by itself.
+        "learning_rate": 1e-3 if algorithm.clones else "lin_1.0e-3",
         "n_steps": STEPS,
+        "stats_window_size": 10,
         **{key: value for key, value in _SMALL_UPDATES.items() if key in algorithm.parameters},
         **changes,
     }

@@ -1,20 +1,127 @@
-"""What two training runs have in common."""
+"""Runs that are trained in this process, cut and resumed, and what two runs have in common."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_roles.common.checkpoint import Checkpoint
+from sb3_roles.common.checkpoint import Checkpoint, CheckpointFolder
+from sb3_roles.zoo.job import run_callbacks, with_state
+from sb3_roles.zoo.models import make_env, make_model
+from sb3_roles.zoo.run_folder import CHECKPOINTS
+from sb3_roles.zoo.stop_signals import StopSignals
+from sb3_roles.zoo.training import CsvLog, train
 
 TIMINGS = ("time/fps", "time/time_elapsed")
 """Columns of ``progress.csv`` that differ from one run to the next; no others do."""
 LOGS = ("progress.csv", "roles.csv", "evaluations.csv")
+EVALUATED = {"eval_freq": 40, "eval_episodes": 2, "verbose": 0}
+NOT_EVALUATED = {**EVALUATED, "eval_freq": 0}
+
+
+class Trained(NamedTuple):
+    """What a training has left.
+
+    :param model: the algorithm; its environment is closed
+    :param newest: the run's newest checkpoint
+    """
+
+    model: OnPolicyAlgorithm
+    newest: Checkpoint
+
+
+@contextmanager
+def torch_threads(number: int) -> Iterator[None]:
+    """Let torch have a number of threads, and what it had before at the end.
+
+    :param number: of threads
+    """
+    before = th.get_num_threads()
+    th.set_num_threads(number)
+    try:
+        yield
+    finally:
+        th.set_num_threads(before)
+
+
+def stir(seed: int) -> None:
+    """Set the global generators to what another process might start with.
+
+    :param seed: of that process
+    """
+    th.manual_seed(seed)
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002
+
+
+def train_here(
+    folder: Path,
+    config: Mapping[str, Any],
+    resume: bool = False,
+    stop_at: int | None = None,
+    save_freq: int = 0,
+    options: Mapping[str, Any] = EVALUATED,
+    checkpoints: CheckpointFolder | None = None,
+    prepare: Callable[[OnPolicyAlgorithm], object] = lambda model: None,
+    callbacks: Sequence[Any] = (),
+    process: int = 99,
+) -> Trained:
+    """Train in this process as ``train.py`` does in one of its own, with its logs and callbacks.
+
+    :param folder: of the run; made if it is not there
+    :param config: checked
+    :param resume: go on from the newest checkpoint of the folder
+    :param stop_at: joint steps after which to stop early
+    :param save_freq: joint steps between checkpoints; 0 for the last one only
+    :param options: see ``job.run_callbacks``
+    :param checkpoints: where they are written, instead of a plain folder
+    :param prepare: called with the model before anything is restored
+    :param callbacks: further ones, whose state is not kept
+    :param process: stands for the state of the global generators that a process begins with
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    stir(process)
+    env = make_env(config)
+    try:
+        model = make_model(config, env, "cpu")
+        # The constructor has seeded them with the run's seed; a resumed run must not rely on it.
+        if resume:
+            stir(process + 1)
+        log = CsvLog(folder / "progress.csv")
+        model.set_logger(Logger(str(folder), [log]))
+        if checkpoints is None:
+            checkpoints = CheckpointFolder(folder / CHECKPOINTS)
+        checkpoints.prepare()
+        prepare(model)
+        with ExitStack() as stack:
+            own = run_callbacks(folder, model, config, options, stack)
+            train(
+                model,
+                config["n_timesteps"],
+                checkpoints,
+                StopSignals(),
+                [*own, *callbacks],
+                with_state(log, own, model),
+                config,
+                resume=checkpoints.newest()[1] if resume else None,
+                save_freq=save_freq,
+                stop_at=stop_at,
+            )
+        return Trained(model, checkpoints.newest()[1])
+    finally:
+        env.close()
+
+
+# What two runs have in common
 
 
 def without_times(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -87,15 +87,19 @@ def write_yaml(path: Path, values: Mapping[str, Any]) -> None:
     """Write a YAML file of data, keys in their order, whole or not at all."""
     import yaml
 
-    text = yaml.safe_dump(_plain(values), sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump(plain(values), sort_keys=False, allow_unicode=True)
     write_atomically(path, text.encode())
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return values as they are read again from a file: dicts with texts as keys, and lists.
+
+    :param value: possibly nested
+    """
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -21,11 +21,11 @@ from stable_baselines3.common.logger import (
 )
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_roles.common import snapshot
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
 from sb3_roles.common.checkpoint_fit import check_outline
 from sb3_roles.common.env_state import env_gap
+from sb3_roles.common.facts import differences, machine_facts
 from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
@@ -40,7 +40,7 @@ from sb3_roles.evaluation.evaluators import (
     scenes_evaluator,
 )
 from sb3_roles.zoo.algorithms import get_algorithm
-from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
+from sb3_roles.zoo.config import CONFIG_FILE, plain, write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, ENVIRONMENTS, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
 from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model, steps_of
@@ -95,6 +95,10 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
+        if options.get("strict_resume") and _has_checkpoint(Path(job["resume"])):
+            # Before anything in the folder is touched, even its lock.
+            folder = CheckpointFolder(Path(job["resume"]) / CHECKPOINTS)
+            _note_inexact(_read_newest(folder, model, complete(config))[2], job)
         # Ray has a handler of its own.
         with rollouts_on_ray(model, config, options), stop.caught():
             with stop.waiting():
@@ -158,19 +162,25 @@ def _command(job: Mapping[str, Any]) -> list[str]:
     return list(job.get("command") or [Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
+def _has_checkpoint(run: Path) -> bool:
+    """Whether a run has one, or had: what was evaluated had, and has lost it."""
+    return bool(CheckpointFolder(run / CHECKPOINTS).paths()) or (run / SCORES_FILE).exists()
+
+
 def _train_in(
     run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any], stop: StopSignals
 ) -> int:
-    config, options = job["config"], job["options"]
+    config, options = complete(job["config"]), job["options"]
     checkpoints = CheckpointFolder(run / CHECKPOINTS)
     checkpoints.prepare()
     for folder in (run, run / BEST):
         remove_partial(folder)
     resume, begun = None, 0
-    if job["resume"] is not None and not checkpoints.paths() and not (run / SCORES_FILE).exists():
+    if job["resume"] is not None and not _has_checkpoint(run):
         print(f"{run} has no checkpoint yet: it begins anew", flush=True)
     elif job["resume"] is not None:
-        resume, begun = _read_newest(checkpoints, model, config)
+        resume, begun, reasons = _read_newest(checkpoints, model, config)
+        _note_inexact(reasons, job)
         if options.get("n_timesteps", begun) < begun:
             wanted = options["n_timesteps"]
             raise UsageError(f"{run} has {begun} joint steps already, more than -n {wanted}")
@@ -180,7 +190,7 @@ def _train_in(
         logger = _logger(run, log, config, options)
         stack.callback(logger.close)
         model.set_logger(logger)
-        callbacks = _callbacks(run, model, config, options, stack)
+        callbacks = run_callbacks(run, model, config, options, stack)
         _print_start(run, model, config, None if resume is None else begun)
         if get_algorithm(config["algo"]).clones:
             _get_demonstrations(run, model, job, resume is None)
@@ -199,8 +209,7 @@ def _train_in(
                 checkpoints,
                 stop,
                 [*callbacks, *bar],
-                # An algorithm may know more than weights and counters.
-                stateful=[log, *callbacks, *([model] if hasattr(model, "get_state") else [])],
+                stateful=with_state(log, callbacks, model),
                 config=config,
                 resume=resume,
                 save_freq=options["save_freq"],
@@ -250,13 +259,21 @@ def _kept(run: Path, model: OnPolicyAlgorithm, error: NotFiniteError) -> str:
         return f"{message}; {path} could not be written: {failure.strerror or failure}"
 
 
-def _callbacks(
+def run_callbacks(
     run: Path,
     model: OnPolicyAlgorithm,
     config: Mapping[str, Any],
     options: Mapping[str, Any],
     stack: ExitStack,
 ) -> list[Any]:
+    """Make the callbacks of a run.
+
+    :param run: folder of what they write
+    :param model: to be trained
+    :param config: checked
+    :param options: ``eval_freq``, ``eval_episodes`` and ``verbose``
+    :param stack: closes what they have open
+    """
     window = model._stats_window_size
     callbacks: list[Any] = [TeamMetricsCallback(window)]
     if get_algorithm(config["algo"]).wrapper == "role":
@@ -276,12 +293,22 @@ def _callbacks(
     return callbacks
 
 
+def with_state(log: CsvLog, callbacks: Sequence[Any], model: OnPolicyAlgorithm) -> list[Any]:
+    """Return what a checkpoint keeps the state of, beside the model's weights and counters.
+
+    :param log: the run's
+    :param callbacks: of :func:`run_callbacks`
+    :param model: an algorithm may know more than weights and counters
+    """
+    return [log, *callbacks, *([model] if hasattr(model, "get_state") else [])]
+
+
 def _read_newest(
     checkpoints: CheckpointFolder, model: OnPolicyAlgorithm, config: Mapping[str, Any]
-) -> tuple[Checkpoint, int]:
-    """Read where a run was, and say what may keep it from going on bit for bit.
+) -> tuple[Checkpoint, int, list[str]]:
+    """Read where a run was; nothing is written.
 
-    :return: the checkpoint and its joint steps
+    :return: the checkpoint, its joint steps, and what may keep it from going on bit for bit
     """
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -297,16 +324,21 @@ def _read_newest(
         print(f"warning: {warning.message}", flush=True)
     assert model.env is not None
     machine, trained = (checkpoint.manifest.get(name) for name in ("machine", "config"))
-    saved = machine if isinstance(machine, dict) else {}
-    reasons = snapshot.differences(saved, snapshot.machine_facts(model.device))
+    reasons = differences(machine if isinstance(machine, dict) else {}, machine_facts(model))
     gap = env_gap(model.env)
     reasons += [] if gap is None else [gap]
-    before = trained.get("n_timesteps") if isinstance(trained, dict) else None
-    if before != config["n_timesteps"]:
-        reasons.append(f"n_timesteps was {before}, is {config['n_timesteps']}")
-    if reasons:
-        print(f"not bit-exact: {'; '.join(reasons)}", flush=True)
-    return checkpoint, begun
+    reasons += differences(trained if isinstance(trained, dict) else {}, plain(config))
+    return checkpoint, begun, [" ".join(reason.split()) for reason in reasons]
+
+
+def _note_inexact(reasons: Sequence[str], job: Mapping[str, Any]) -> None:
+    """Say, or refuse, what may keep a run from going on bit for bit."""
+    if not reasons:
+        return
+    text = f"not bit-exact: {'; '.join(reasons)}"
+    if job["options"].get("strict_resume"):
+        raise UsageError(f"--strict-resume: {job['resume']}: {text}")
+    print(text, flush=True)
 
 
 def _logger(

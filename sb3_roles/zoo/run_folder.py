@@ -8,12 +8,12 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
 from sb3_roles._version import __version__
 from sb3_roles.common.files import append
+from sb3_roles.common.versions import PACKAGES, version_of
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import folder_name
 from sb3_roles.zoo.launcher import process_settings
@@ -21,7 +21,6 @@ from sb3_roles.zoo.options import UsageError
 
 ARGS_FILE, COMMAND_FILE, LOCK_FILE = "args.yml", "command.txt", "lock"
 CHECKPOINTS, BEST = "checkpoints", "best"
-_PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "numpy", "numba", "gymnasium")
 
 
 def _numbered(folder: Path, env: str) -> dict[int, Path]:
@@ -149,20 +148,11 @@ def note_command(run: Path, command: Sequence[str]) -> None:
     """
     commit = source_commit(Path(__file__)) or "null"
     lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
-    lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(_versions()))
+    versions = [f"{name} {version_of(name)}" for name in PACKAGES]
+    lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(versions))
     lines.append(f"# {process_settings()}")
     _refuse_link(run / COMMAND_FILE)
     append(run / COMMAND_FILE, ("\n".join(lines) + "\n").encode())
-
-
-def _versions() -> list[str]:
-    found = []
-    for name in _PACKAGES:
-        try:
-            found.append(f"{name} {metadata.version(name)}")
-        except metadata.PackageNotFoundError:
-            found.append(f"{name} unknown")
-    return found
 
 
 def source_commit(file: Path) -> str | None:

@@ -118,6 +118,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("-P", "--progress", action="store_true", help="show a progress bar")
     add("--resume", type=Path, metavar="RUN", help="run folder to continue bit for bit; needs "
         "--env, too, if that is module:factory")  # fmt: skip
+    add("--strict-resume", action="store_true", help="with --resume: go on only if nothing "
+        "is known that keeps it from being bit for bit, such as other threads, versions or kinds "
+        "of processors; else exit with code 2, and leave the run as it is")  # fmt: skip
     add("--verbose", type=whole_number(0, 2), metavar="N", help="0 prints the outcome only")
 
 

@@ -38,6 +38,7 @@ DEFAULTS: dict[str, Any] = {
     "device": "auto",
     "num_threads": None,
     "progress": False,
+    "strict_resume": False,
     "verbose": 1,
 }
 GIVEN = frozenset(
@@ -58,6 +59,7 @@ GIVEN = frozenset(
 # What may be given together with --resume; the rest is the run's.
 _FREE = (
     "resume",
+    "strict_resume",
     "env",
     "n_timesteps",
     "device",
@@ -91,6 +93,8 @@ def new_jobs(given: Mapping[str, Any]) -> tuple[list[RunName], list[dict[str, An
     :raises ConfigError: if a configuration is wrong
     :raises UsageError: if the options do not go together
     """
+    if "strict_resume" in given:
+        raise UsageError("--strict-resume needs --resume RUN")
     algos = given.get("algo", (None,))
     changes = given.get("vary", (None,))
     if len(algos) > 1 and "conf_file" in given:

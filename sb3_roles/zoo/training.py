@@ -16,6 +16,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common import snapshot
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+from sb3_roles.common.facts import machine_facts
 from sb3_roles.common.files import append, csv_bytes, open_regular, write_atomically
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.zoo.stop_signals import StopSignals
@@ -38,7 +39,8 @@ def _short_lines(file: TextIO) -> Iterator[str]:
 class CsvLog(KVWriter):
     """``progress.csv``, whose rows and columns a resumed run takes up where the checkpoint was.
 
-    SB3's writer empties the file when it is opened, and its columns change with the hash seed.
+    SB3's writer empties the file when it is opened, and its columns change with the hash seed. Rows
+    are kept in the file alone: a run may have any number of them.
 
     :param path: the file
     """
@@ -46,7 +48,7 @@ class CsvLog(KVWriter):
     def __init__(self, path: Path) -> None:
         self.path = path
         self.columns: list[str] = []
-        self.rows: list[list[str]] = []
+        self.n_rows = 0
 
     def write(
         self,
@@ -60,40 +62,46 @@ class CsvLog(KVWriter):
         self.columns += new
         # A number that waited in a checkpoint is not numpy's any more, and shall look the same.
         plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()}
-        self.rows.append([str(plain.get(key, "")) for key in self.columns])
+        row = [str(plain.get(key, "")) for key in self.columns]
         if new:
-            self._rewrite()
-            return
-        append(self.path, csv_bytes(self.rows[-1], []))
+            self._rewrite([*self._read(), row])
+        else:
+            append(self.path, csv_bytes(row, []))
+        self.n_rows += 1
 
-    def _rewrite(self) -> None:
+    def _read(self) -> list[list[str]]:
+        """Return the rows of the run so far, without the header."""
+        if not self.n_rows or not self.path.exists():
+            return []
+        try:
+            with io.TextIOWrapper(open_regular(self.path), "utf-8", newline="") as file:
+                rows = list(islice(csv.reader(_short_lines(file)), 1 + self.n_rows))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise CheckpointError(f"{self.path}: damaged log: {error}") from error
+        return rows[1:]
+
+    def _rewrite(self, rows: list[list[str]]) -> None:
         width = len(self.columns)
-        self.rows = [row + [""] * (width - len(row)) for row in self.rows]
-        write_atomically(self.path, csv_bytes(self.columns, self.rows))
+        full = [row[:width] + [""] * (width - len(row)) for row in rows]
+        write_atomically(self.path, csv_bytes(self.columns, full))
 
     def close(self) -> None:
         """Nothing is open."""
 
     def get_state(self) -> dict[str, Any]:
         """Return how much of the file belongs to the run so far."""
-        return {"columns": self.columns, "rows": len(self.rows)}
+        return {"columns": list(self.columns), "rows": self.n_rows}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Drop what was written after :meth:`get_state`.
 
         :raises CheckpointError: if the file is no log
         """
-        rows: list[list[str]] = []
-        if self.path.exists():
-            n_rows = int(state["rows"])
-            try:
-                with io.TextIOWrapper(open_regular(self.path), "utf-8", newline="") as file:
-                    rows = list(islice(csv.reader(_short_lines(file)), 1 + n_rows))
-            except (UnicodeDecodeError, csv.Error) as error:
-                raise CheckpointError(f"{self.path}: damaged log: {error}") from error
         self.columns = [str(name) for name in state["columns"]]
-        self.rows = [row[: len(self.columns)] for row in rows[1 : 1 + int(state["rows"])]]
-        self._rewrite()
+        self.n_rows = int(state["rows"])
+        rows = self._read()
+        self._rewrite(rows)
+        self.n_rows = len(rows)
 
 
 class _Check(BaseCallback):
@@ -177,7 +185,7 @@ def train(
         env_steps = model.num_timesteps // n_agents
         manifest = {
             "config": dict(config or {}),
-            "machine": snapshot.machine_facts(model.device),
+            "machine": machine_facts(model),
             "env_steps": env_steps,
             "agent_steps": model.num_timesteps,
         }
