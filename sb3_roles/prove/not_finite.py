@@ -19,6 +19,7 @@ import torch as th
 
 from sb3_roles.common import buffers
 from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
+from sb3_roles.common.names import one_line
 from sb3_roles.common.not_finite import NOT_FINITE_FILE
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.mappo import mappo
@@ -96,7 +97,12 @@ def trial(algo: str, part: str, value: float, folder: Path, rng: np.random.Gener
         stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            code = main(list(map(str, words)), "train")
+            try:
+                code: object = main(list(map(str, words)), "train")
+            except Exception as error:
+                code = f"of a traceback, {type(error).__name__}: {one_line(error)}"
+    if not seen:
+        return [f"no training: {err.getvalue()[:200]!r}"]
     model, watch = seen
     lines = err.getvalue().splitlines()
     found = [] if code == 3 else [f"exit code {code}"]
@@ -203,7 +209,7 @@ def _injected(model: Any, part: str, value: float, rng: np.random.Generator) -> 
                 if next(asked) < minibatch:
                     return given
                 changed = given.clone()
-                changed.view(-1)[0] = value
+                changed[(0,) * changed.ndim] = value
                 return changed
 
             stack.callback(chosen.register_hook(gradient).remove)
