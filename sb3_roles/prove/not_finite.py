@@ -8,6 +8,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -202,17 +203,20 @@ def _injected(model: Any, part: str, value: float, rng: np.random.Generator) -> 
             _poison_loss(model, replaced, minibatch, value)
         else:
             parameters = [one for one in model.policy.parameters() if one.requires_grad]
-            chosen = parameters[int(rng.integers(len(parameters)))]
-            asked = itertools.count()
+            order, asked = rng.permutation(len(parameters)).tolist(), [0] * len(parameters)
 
-            def gradient(given: th.Tensor) -> th.Tensor:
-                if next(asked) < minibatch:
+            def gradient(given: th.Tensor, k: int) -> th.Tensor:
+                asked[k] += 1
+                # Not of a parameter that this algorithm does not learn.
+                chosen = next(one for one in order if asked[one])
+                if k != chosen or asked[k] <= minibatch:
                     return given
                 changed = given.clone()
                 changed[(0,) * changed.ndim] = value
                 return changed
 
-            stack.callback(chosen.register_hook(gradient).remove)
+            for k, parameter in enumerate(parameters):
+                stack.callback(parameter.register_hook(partial(gradient, k=k)).remove)
         yield
 
 
