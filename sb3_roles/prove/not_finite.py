@@ -8,6 +8,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -19,6 +20,7 @@ import torch as th
 
 from sb3_roles.common import buffers
 from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
+from sb3_roles.common.names import one_line
 from sb3_roles.common.not_finite import NOT_FINITE_FILE
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.mappo import mappo
@@ -96,7 +98,12 @@ def trial(algo: str, part: str, value: float, folder: Path, rng: np.random.Gener
         stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            code = main(list(map(str, words)), "train")
+            try:
+                code: object = main(list(map(str, words)), "train")
+            except Exception as error:
+                code = f"of a traceback, {type(error).__name__}: {one_line(error)}"
+    if not seen:
+        return [f"no training: {err.getvalue()[:200]!r}"]
     model, watch = seen
     lines = err.getvalue().splitlines()
     found = [] if code == 3 else [f"exit code {code}"]
@@ -196,17 +203,20 @@ def _injected(model: Any, part: str, value: float, rng: np.random.Generator) -> 
             _poison_loss(model, replaced, minibatch, value)
         else:
             parameters = [one for one in model.policy.parameters() if one.requires_grad]
-            chosen = parameters[int(rng.integers(len(parameters)))]
-            asked = itertools.count()
+            order, asked = rng.permutation(len(parameters)).tolist(), [0] * len(parameters)
 
-            def gradient(given: th.Tensor) -> th.Tensor:
-                if next(asked) < minibatch:
+            def gradient(given: th.Tensor, k: int) -> th.Tensor:
+                asked[k] += 1
+                # Not of a parameter that this algorithm does not learn.
+                chosen = next(one for one in order if asked[one])
+                if k != chosen or asked[k] <= minibatch:
                     return given
                 changed = given.clone()
-                changed.view(-1)[0] = value
+                changed[(0,) * changed.ndim] = value
                 return changed
 
-            stack.callback(chosen.register_hook(gradient).remove)
+            for k, parameter in enumerate(parameters):
+                stack.callback(parameter.register_hook(partial(gradient, k=k)).remove)
         yield
 
 
