@@ -72,9 +72,11 @@ class Case:
         return ", ".join([*filter(None, words), f"{self.threads} threads"])
 
     def config(self, n_iterations: int, seed: int) -> dict[str, Any]:
-        """Return its checked configuration.
+        """Return its checked configuration, of a run that is stopped before its last iteration.
 
-        :param n_iterations: of the whole run
+        At the end of a run the learning rate is 0, and whatever was forgotten would not show.
+
+        :param n_iterations: that are trained
         :param seed: of the run
         """
         batch = _BATCH if "batch_size" in ALGORITHMS[self.algo].parameters else {}
@@ -83,7 +85,7 @@ class Case:
             own = SMALL_POLICIES[next(iter(ALGORITHMS[self.algo].policies))]
             given = changes.get("policy_kwargs", own)
             changes["policy_kwargs"] = {**given, "precision": self.precision}
-        return small_run(self.algo, self.backend, n_iterations, seed=seed, **changes)
+        return small_run(self.algo, self.backend, n_iterations + 1, seed=seed, **changes)
 
 
 def precisions(algo: str) -> tuple[str, ...]:
@@ -172,7 +174,8 @@ def cuts(setting: Setting) -> Outcome:
         f"cuts of {len(cases)} runs of {n_iterations} iterations, {algos} algorithms: weights, "
         f"optimizer, whole state and logs those of straight runs; {alone} have one precision"
     )
-    stock = stock_cuts(setting.seed, setting.folder / "stock", n_iterations, after)
+    of_stock = after[:1] if setting.quick else after
+    stock = stock_cuts(setting.seed, setting.folder / "stock", n_iterations, of_stock)
     return Outcome(held, len(cases) * len(after), said, tuple(failures), stock)
 
 
@@ -188,21 +191,25 @@ def try_case(
     :param seed: of the run
     :return: what differs by the cut that it was found at
     """
-    config = case.config(n_iterations, seed)
+    config, end = case.config(n_iterations, seed), n_iterations * ITERATION
     photographs = folder / "cut"
     with torch_threads(case.threads):
-        straight = train_here(folder / "straight", config)
+        straight = train_here(folder / "straight", config, stop_at=end)
         saving = folder / "saving"
         train_here(
             saving,
             config,
+            stop_at=end,
             save_freq=ITERATION,
             checkpoints=_Photographer(saving, photographs),
             process=seed + 100,
         )
         broken = {}
         for cut in after:
-            why = _resume(photographs / str(cut), folder / "straight", straight, config, cut)
+            run = photographs / str(cut)
+            why = _resume(run, config, end, 200 + cut, straight) or log_difference(
+                folder / "straight", run
+            )
             if why is not None:
                 broken[cut] = why
     shutil.rmtree(folder)
@@ -210,19 +217,17 @@ def try_case(
 
 
 def _resume(
-    run: Path, straight_run: Path, straight: Trained, config: Mapping[str, Any], cut: int
+    run: Path, config: Mapping[str, Any], end: int, process: int, straight: Trained
 ) -> str | None:
     """Go on as another process would; return what is not as in the straight run."""
     with open(run / "progress.csv", "a", encoding="utf-8") as file:
         # Of an iteration that was begun before the process died.
         file.write("1,2,3\n1,")
     try:
-        resumed = train_here(run, config, resume=True, process=200 + cut)
+        resumed = train_here(run, config, resume=True, stop_at=end, process=process)
     except CheckpointError as error:
         return str(error)
-    return checkpoint_difference(straight.newest, resumed.newest) or log_difference(
-        straight_run, run
-    )
+    return checkpoint_difference(straight.newest, resumed.newest)
 
 
 # The stock stack
@@ -236,7 +241,8 @@ def stock_cuts(seed: int, folder: Path, n_iterations: int, after: Sequence[int])
     :param n_iterations: of the whole run
     :param after: iterations after which it is saved
     """
-    config = small_run("ppo", n_iterations=n_iterations, seed=seed)
+    # A constant rate: of two calls of learn() each would let a schedule fall to its end.
+    config = small_run("ppo", n_iterations=n_iterations, seed=seed, learning_rate=1e-3)
     folder.mkdir(parents=True)
     with torch_threads(1):
         straight = _learn(config, n_iterations, folder, None)
