@@ -195,7 +195,7 @@ def test_r6_judges_a_load(told, part):
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: os.symlink("/dev/zero", path)])
 def test_only_files_are_opened(make, tmp_path):
     make(tmp_path / "x")
-    with pytest.raises(OSError, match="not a regular file|Is a directory"):
+    with pytest.raises(OSError, match=r"not a regular file|Is a directory"):
         open_regular(tmp_path / "x")
 
 

@@ -38,7 +38,7 @@ def _config(text: str, *named: str, lines: int = 1, algo: str = "hmappo") -> Cas
 
 def _file(content: str | bytes, *named: str, lines: int = 1, algo: str = "hmappo") -> Case:
     words = ("train.py", "--algo", algo, "-conf", "bad.yml")
-    return Case(words, ("bad.yml", *named) if not lines else named, lines, {"bad.yml": content})
+    return Case(words, named, lines, {"bad.yml": content})
 
 
 def _words(text: str, *named: str, **files: str | bytes) -> Case:
