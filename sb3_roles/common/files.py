@@ -45,7 +45,10 @@ def open_regular(path: str | Path) -> BinaryIO:
     :param path: the file, or a link to one
     :raises OSError: if it is something else, or can not be opened
     """
-    if not stat.S_ISREG(os.stat(path).st_mode):
+    mode = os.stat(path).st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, "not a regular file", str(path))
     # The flag, where the system has it, for what is put in its place in between.
     file = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
