@@ -15,6 +15,9 @@ from sb3_roles.common import checkpoint_reading, stored_zip
 from sb3_roles.common.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
 from sb3_roles.common.files import open_regular
 from sb3_roles.common.yaml_text import load_yaml
+from sb3_roles.evaluation import records
+from sb3_roles.evaluation.records import RecordsError, read_records
+from sb3_roles.gnn.demonstrations import load_demonstrations
 from sb3_roles.hmappo import HMAPPO
 from sb3_roles.mappo import MAPPO
 from sb3_roles.mappo.policies import TeamActorCriticPolicy
@@ -197,6 +200,24 @@ def test_only_files_are_opened(make, tmp_path):
     make(tmp_path / "x")
     with pytest.raises(OSError, match=r"not a regular file|Is a directory"):
         open_regular(tmp_path / "x")
+
+
+@pytest.mark.parametrize("load", [read_records, load_demonstrations])
+def test_other_loaders_do_not_wait_for_a_pipe(load, tmp_path):
+    os.mkfifo(tmp_path / "x")
+    with pytest.raises(ValueError, match="not a regular file") as caught:
+        load(tmp_path / "x")
+    assert "\n" not in str(caught.value)
+
+
+def test_records_of_too_many_rows_are_not_read(tmp_path, monkeypatch):
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table({"a": np.zeros(1000, np.int8)}), tmp_path / "x")
+    monkeypatch.setattr(records, "_MAX_VALUES", 999)
+    with pytest.raises(RecordsError, match="1000 rows"):
+        read_records(tmp_path / "x")
 
 
 def test_yaml_may_have_aliases_but_not_bombs():

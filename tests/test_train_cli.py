@@ -276,13 +276,13 @@ def test_a_resume_that_fails_leaves_the_run_alone(logs, tmp_path, capsys):
     shutil.copytree(logs[0] / "mappo" / "area-search-v0_1", run)
     files = ("config.yml", "command.txt", "progress.csv")
     config = yaml.safe_load((run / "config.yml").read_text())
-    write_yaml(run / "config.yml", {**config, "policy_kwargs": {"graph_width": 9}})
-    before = [(run / name).read_bytes() for name in files]
     wrong = [
-        (["-n", "640"], "do not fit the configuration"),
-        (["-n", "100"], "has 320 joint steps already, more than -n 100"),
+        (["-n", "640"], {"policy_kwargs": {"graph_width": 9}}, "do not fit the configuration"),
+        (["-n", "100"], {}, "has 320 joint steps already, more than -n 100"),
     ]
-    for args, message in wrong:
+    for args, changes, message in wrong:
+        write_yaml(run / "config.yml", {**config, **changes})
+        before = [(run / name).read_bytes() for name in files]
         code, _, err = run_main(capsys, "--resume", str(run), *args)
         assert code == 2
         assert message in err

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from area_search import kernels
-from sb3_roles.common.files import write_atomically
+from sb3_roles.common.files import open_regular, write_atomically
 from sb3_roles.common.names import one_line
 from sb3_roles.evaluation.header import checked_scene
 
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 FORMAT, FORMAT_VERSION = "sb3_roles episode records", 1
 _KEY = b"sb3_roles"
+_MAX_VALUES = 1 << 30
 NEVER = kernels.NEVER
 METRICS = kernels.METRICS
 NO_ROLE = -1
@@ -247,7 +248,11 @@ def read_records(path: str | Path) -> EpisodeRecords:
     import pyarrow.parquet as pq
 
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
+            # A few bytes can stand for any number of equal rows.
+            about = pq.read_metadata(file)
+            if about.num_rows * about.num_columns > _MAX_VALUES:
+                raise RecordsError(f"{path}: {about.num_rows} rows, more than are ever recorded")
             table = pq.read_table(file, page_checksum_verification=True)
     except (OSError, pa.ArrowException) as error:
         # Of damage, Arrow raises an OSError that has no number.

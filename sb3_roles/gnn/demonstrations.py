@@ -16,7 +16,7 @@ import numpy as np
 
 from area_search.cells import JOINT_CHANNELS, KNOWN_CHANNELS, N_ACTIONS
 from area_search.kernels import METRICS
-from sb3_roles.common.files import write_atomically
+from sb3_roles.common.files import open_regular, write_atomically
 from sb3_roles.common.names import one_line
 from sb3_roles.common.policies import POSITION_KEY
 from sb3_roles.common.team_wrapper import AGENT_KEY
@@ -196,7 +196,12 @@ def load_demonstrations(path: str | Path) -> Demonstrations:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(path) as archive:
+    with open_regular(path) as file:
+        return _read_open(path, file)
+
+
+def _read_open(path: Path, opened: IO[bytes]) -> dict[str, np.ndarray]:
+    with zipfile.ZipFile(opened) as archive:
         entries = archive.infolist()
         if sorted(entry.filename for entry in entries) != sorted(f"{k}.npy" for k in _ARRAYS):
             raise DemonstrationError(f"{path}: no demonstrations of sb3_roles")
@@ -210,7 +215,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
                 problem = _header_problem(file, entry)
             if problem is not None:
                 raise DemonstrationError(f"{path}: damaged demonstrations: {problem}")
-    with np.load(path, allow_pickle=False) as content:
+    opened.seek(0)
+    with np.load(opened, allow_pickle=False) as content:
         return {name: content[name] for name in _ARRAYS}
 
 
