@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import shutil
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +14,9 @@ pytest.importorskip("ray", reason="the extra ray is not installed")
 
 from ray.cluster_utils import Cluster
 
-from sb3_roles.common.checkpoint import CheckpointFolder
+from sb3_roles.prove.ray_deaths import die_once
+from sb3_roles.prove.remains import first_odd, remains_of_run
+from sb3_roles.prove.training_runs import untimed_rows
 from sb3_roles.zoo import ray_rollouts
 from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.ray_runs import RunOf, run_arguments, train_run
@@ -68,41 +68,9 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(tmp_path_factory.mktemp("alone"), *N_STEPS)
 
 
-def contents(run: Path) -> dict[str, object]:
-    """What a run leaves, but for times."""
-    found: dict[str, object] = {
-        name: (run / name).read_text() for name in ("roles.csv", "evaluation.yml")
-    }
-    with open(run / "progress.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    times = ("time/fps", "time/time_elapsed")
-    found["progress"] = [{k: v for k, v in row.items() if k not in times} for row in rows]
-    found["evaluations"] = sorted(
-        (path.name, path.read_bytes()) for path in run.glob("evaluations/*") if path.is_file()
-    )
-    folder = CheckpointFolder(run / "checkpoints")
-    found["checkpoints"] = [path.name for path in folder.paths()]
-    _, checkpoint = folder.newest()
-    found["weights"] = {name: one.tolist() for name, one in checkpoint.policy.items()}
-    found["optimizer"] = {name: one.tolist() for name, one in checkpoint.optimizer.items()}
-    state = {k: v for k, v in checkpoint.state.items() if k not in ("elapsed_ns", "logger")}
-    found["state"] = repr(state)
-    return found
-
-
 def assert_same(run: Path, other: Path) -> None:
-    one, two = contents(run), contents(other)
-    for name, value in one.items():
-        assert value == two[name], name
-    assert len(one["progress"]) > 1
-
-
-def die_once(name: str) -> None:
-    """End this process as a machine's failure would, the first time that it is asked to."""
-    life = Path(os.environ[LIVES], name)
-    if not life.exists():
-        life.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
+    assert first_odd(remains_of_run(run), remains_of_run(other)) == ""
+    assert len(untimed_rows(run / "progress.csv")) > 2
 
 
 def play_or_die(config, folder, task, weights, n_threads):
@@ -111,7 +79,7 @@ def play_or_die(config, folder, task, weights, n_threads):
     count = len(os.listdir(os.environ[LIVES]))
     Path(os.environ[LIVES], f"played_{count}_{os.getpid()}").touch()
     if count >= 2:
-        die_once("death")
+        die_once(Path(os.environ[LIVES], "death"))
     return record
 
 
