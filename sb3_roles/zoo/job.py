@@ -245,6 +245,8 @@ def _train_in(
     print(f"{run}: {steps} joint steps; checkpoints: {len(checkpoints.paths())}", flush=True)
     stop.check()
     _evaluate(run, model, config, options["eval_episodes"])
+    # Of a signal that came while the scores were written: no other run shall begin.
+    stop.check()
     return 0
 
 
