@@ -241,6 +241,20 @@ def test_the_last_ones_are_kept_and_remains_removed(tmp_path, content):
         CheckpointFolder(tmp_path, keep=1)
 
 
+def test_what_is_saved_after_going_back_is_kept(tmp_path, content):
+    folder = CheckpointFolder(tmp_path, keep=2)
+    # A kill before the oldest was removed, and two files that are damaged.
+    folder.save(10, **content)
+    for step in (30, 40):
+        (tmp_path / f"step_{step:012d}.ckpt").write_bytes(b"damaged")
+    saved = folder.save(20, **content)
+    with pytest.warns(UserWarning, match=f"going back to {saved.name}"):
+        assert folder.newest()[0] == saved
+    folder.save(30, **content)
+    folder.save(40, **content)
+    assert [path.name[-7:] for path in folder.paths()] == ["30.ckpt", "40.ckpt"]
+
+
 def test_damaged_files_are_refused(tmp_path, content):
     folder = CheckpointFolder(tmp_path)
     folder.save(1, **content)

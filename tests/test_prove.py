@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import pytest
 
 from sb3_roles.prove import promises
@@ -90,6 +93,29 @@ def test_an_interruption_keeps_the_table_of_what_was_tried(monkeypatch, tmp_path
     assert main(["prove", "R1", "R2", "-o", str(table)]) == 130
     assert "| R1 | " in table.read_text()
     assert not any(setting.folder.exists() for _, setting in seen)
+
+
+def test_an_experiment_that_fails_is_broken_and_the_others_are_tried(monkeypatch, capsys):
+    outcomes = {"R1": TimeoutError("no save\nin 300 s"), "R3": Outcome(2, 2, "kept")}
+    seen = replaced(monkeypatch, outcomes)
+    assert main(["prove", "R1", "R3"]) == 1
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith("R1 BROKEN: 0/0 the experiment failed (")
+    assert printed[1] == "    TimeoutError: no save in 300 s"
+    assert printed[2].startswith("R3 2/2 kept (")
+    assert not any(setting.folder.exists() for _, setting in seen)
+
+
+def test_sigterm_ends_an_experiment_as_ctrl_c_does(monkeypatch):
+    seen = []
+
+    def prove(self, setting):
+        seen.append(setting.folder)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(promises.Promise, "prove", prove)
+    assert main(["prove", "R1", "R2"]) == 143
+    assert [folder.exists() for folder in seen] == [False]
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,10 @@ def test_differences_have_a_place():
     one = {"a": [1, {"b": np.array([1.0, np.nan])}], "c": th.ones(2)}
     same = {"a": [1, {"b": np.array([1.0, np.nan])}], "c": th.ones(2)}
     assert difference(one, same, "it") is None
+    nan, zero = {"x": th.tensor([np.nan]).bfloat16()}, {"x": th.tensor(0.0)}
+    assert difference(nan, {"x": nan["x"].clone()}, "it") is None
+    assert difference(zero, {"x": -zero["x"]}, "it") == "it/x"
+    assert difference({"x": 0.0}, {"x": -0.0}, "it") == "it/x (0.0, -0.0)"
     for other, where in (
         ({**one, "c": th.ones(2).double()}, "it/c"),
         ({**one, "a": [1, {"b": np.array([1.0, 2.0])}]}, "it/a/1/b"),

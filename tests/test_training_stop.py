@@ -199,6 +199,14 @@ def test_during_the_last_evaluation_the_last_checkpoint_is_whole(tmp_path, monke
     assert (run / "evaluation.yml").exists()
 
 
+def test_a_signal_while_the_scores_are_written_is_not_lost(tmp_path, monkeypatch):
+    words = arguments(tmp_path, "mappo", "-f", str(tmp_path / "logs"), "--n-seeds", "2")
+    stop_once(monkeypatch, os, "replace", only="evaluation.yml")
+    assert main(words, "train") == 143
+    # The other run is not begun.
+    assert (run_of(tmp_path / "logs") / "evaluation.yml").exists()
+
+
 def test_a_finished_run_without_its_checkpoints_does_not_begin_anew(tmp_path, capfd):
     assert main(arguments(tmp_path, "mappo", "-f", str(tmp_path / "logs")), "train") == 0
     run = run_of(tmp_path / "logs")

@@ -145,13 +145,16 @@ class CheckpointFolder:
     def save(self, env_steps: int, **content: Any) -> Path:
         """Write one more, and remove the oldest beyond ``keep``.
 
+        Later ones are left alone and not counted: a run that went back before a damaged one would
+        lose what it has just saved.
+
         :param env_steps: joint steps of the run so far
         :param content: see :func:`write_checkpoint`
         :return: the file
         """
         path = self.folder / f"step_{env_steps:012d}{SUFFIX}"
         write_checkpoint(path, **content)
-        for old in self.paths()[: -self.keep]:
+        for old in [one for one in self.paths() if one <= path][: -self.keep]:
             old.unlink(missing_ok=True)
         return path
 

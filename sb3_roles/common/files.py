@@ -20,6 +20,7 @@ _UNSYNCED = (errno.EINVAL, errno.ENOTSUP)
 # Files are written in milliseconds; a partial one of that age has lost its writer.
 _STALE_SECONDS = 600.0
 _PARTIAL = ".partial"
+_PARTIALS = f"*.[0-9]*{_PARTIAL}"
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -82,7 +83,7 @@ def is_writing(frame: FrameType | None) -> bool:
 
 
 def append(path: Path, content: bytes) -> None:
-    """Add to the end of a file.
+    """Add to the end of a file; it is on the disk when this returns.
 
     :param path: made if it does not exist
     :param content: what to add
@@ -91,6 +92,9 @@ def append(path: Path, content: bytes) -> None:
     try:
         with open(path, "ab") as file:
             file.write(content)
+            file.flush()
+            # A checkpoint counts on the rows of the logs before it.
+            os.fsync(file.fileno())
     except OSError as error:
         if error.filename is None:
             error.filename = str(path)
@@ -115,7 +119,7 @@ def remove_partial(folder: Path) -> None:
 
     :param folder: of the files
     """
-    for path in folder.glob(f"*{_PARTIAL}"):
+    for path in folder.glob(_PARTIALS):
         path.unlink(missing_ok=True)
 
 
@@ -145,7 +149,7 @@ def remove_stale(folder: Path, below: bool = False) -> None:
     :param below: also in all folders below it
     """
     latest = time.time() - _STALE_SECONDS
-    for path in folder.glob(f"{'**/' if below else ''}*.[0-9]*{_PARTIAL}"):
+    for path in folder.glob(f"{'**/' if below else ''}{_PARTIALS}"):
         # Another process may clean as well, or the folder be read-only.
         with suppress(OSError):
             if path.stat().st_mtime < latest:

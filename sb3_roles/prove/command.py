@@ -10,8 +10,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_roles.common.names import one_line
 from sb3_roles.prove.promises import PROMISES, Outcome, Promise, Setting
 from sb3_roles.zoo.options import MAX_TRAINING_SEED, one_of, output_file, whole_number
+from sb3_roles.zoo.stop_signals import StopSignals
 
 if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
@@ -57,6 +59,16 @@ def run(args: argparse.Namespace) -> int:
     :return: 0 if all were kept, 1 if one was broken; one that can not be tried here is neither
     :raises UsageError: if the short form of a promise is asked for that has none
     """
+    stop = StopSignals()
+    try:
+        # So that nothing is left behind after SIGTERM either.
+        with stop.caught():
+            return _run(args)
+    except KeyboardInterrupt:
+        return stop.exit_code
+
+
+def _run(args: argparse.Namespace) -> int:
     from sb3_roles.common.files import write_atomically
     from sb3_roles.prove.table import results_page
     from sb3_roles.zoo.machine import describe_machine
@@ -107,6 +119,10 @@ def _try(promise: Promise, quick: bool, seed: int) -> tuple[Outcome, float]:
 
     try:
         outcome = promise.prove(Setting(quick, folder, seed, note))
+    except Exception as error:
+        # The others shall be tried.
+        text = f"{type(error).__name__}: {one_line(error)}"
+        outcome = Outcome(0, 0, "the experiment failed", (text,))
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return outcome, time.monotonic() - start

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Mapping
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch as th
@@ -27,8 +25,10 @@ from sb3_roles.evaluation.callback import WEIGHTS_FILE, EvaluationCallback
 from sb3_roles.prove.damage import BYTES, CHECKPOINTS, damaged_bytes
 from sb3_roles.prove.promises import Outcome, Setting
 from sb3_roles.prove.small_runs import ITERATION, small_run
+from sb3_roles.prove.training_runs import difference
 from sb3_roles.zoo.models import make_env, make_model
-from sb3_roles.zoo.training import StopSignals, train
+from sb3_roles.zoo.stop_signals import StopSignals
+from sb3_roles.zoo.training import train
 
 _TRIALS, _QUICK_TRIALS = 1000, 60
 _STOCK_TRIALS, _QUICK_STOCK_TRIALS = 1000, 28
@@ -77,33 +77,13 @@ def _problem(path: Path, written: Checkpoint) -> str | None:
         return "the message has several lines" if "\n" in str(error) else None
     except Exception as error:
         return f"{type(error).__name__} instead of one line"
-    return "" if same_checkpoint(found, written) else "other content was read without a word"
+    return "" if _same(found, written) else "other content was read without a word"
 
 
-def same_checkpoint(one: Checkpoint, other: Checkpoint) -> bool:
-    """Whether two checkpoints are the same in every bit.
-
-    :param one: any
-    :param other: any
-    """
+def _same(one: Checkpoint, other: Checkpoint) -> bool:
+    """Whether two checkpoints are the same in every bit, with their times."""
     parts = ((c.manifest, c.policy, c.optimizer, c.state) for c in (one, other))
-    return _same(*parts)
-
-
-def _same(one: Any, other: Any) -> bool:
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, Mapping):
-        return set(one) == set(other) and all(_same(one[key], other[key]) for key in one)
-    if isinstance(one, (list, tuple)):
-        return len(one) == len(other) and all(map(_same, one, other))
-    if isinstance(one, th.Tensor):
-        return _same(one.numpy(), other.numpy())
-    if isinstance(one, np.ndarray):
-        alike = one.shape == other.shape and one.dtype == other.dtype
-        return bool(alike and one.tobytes() == other.tobytes())
-    # A number that is none equals nothing, but is written in one way.
-    return repr(one) == repr(other)
+    return difference(*parts, "checkpoint") is None
 
 
 def sound_files(folder: Path) -> dict[str, list[Path]]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_roles.prove.processes import environment
+from sb3_roles.prove.processes import environment, last_line
 from sb3_roles.prove.promises import Outcome, Setting
 from sb3_roles.prove.remains import first_odd, remains_of_run, remains_of_tables
 from sb3_roles.prove.small_runs import small_settings
@@ -63,7 +63,7 @@ def processes(setting: Setting, before: str = "") -> Outcome:
             text=True,
         )
         if result.returncode:
-            failures.append(f"process {i + 1}: {result.stderr.strip().splitlines()[-1]}")
+            failures.append(f"process {i + 1}: {last_line(result.stderr)}")
             continue
         found.append(json.loads((folder / "remains.json").read_text()))
         odd = first_odd(found[0], found[-1])

@@ -52,8 +52,7 @@ def offsets(setting: Setting) -> Outcome:
     )
     tried = n_offsets + len(files)
     if done.returncode:
-        message = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        return Outcome(0, tried, "the trials broke", (message,))
+        return Outcome(0, tried, "the trials broke", (processes.last_line(done.stderr),))
     found = json.loads(done.stdout)
     said = f"refusals ({n_offsets} in checkpoints, {len(files)} in other files), exit 2, one line"
     return Outcome(

@@ -55,6 +55,8 @@ def hostile(setting: Setting) -> Outcome:
 
     :param setting: how
     """
+    if not Path("/proc/self/statm").exists():
+        return Outcome(0, 0, "", skipped="memory is bounded as Linux counts it, in /proc")
     if not setting.quick:
         return try_kinds(setting, LOADED, RESUMED)
     loaded = {name: LOADED[name] for name in _QUICK if name in LOADED}

@@ -301,6 +301,7 @@ RESUMED: dict[str, Spoil] = {
     "a log that is a pipe": _in_place("progress.csv", os.mkfifo),
     "a lock that is a link": _link("lock", "../elsewhere"),
     "a command that is a link": _link("command.txt", "../elsewhere"),
+    "a folder of the best policy that is a link": _link("best", "../elsewhere"),
     "checkpoints that are a link": _in_place(
         "checkpoints", lambda path: path.symlink_to(path.with_name("moved"))
     ),

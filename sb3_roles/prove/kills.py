@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ WATCHED = "sb3_roles.prove.watched"
 SAVE_LOOPS = "sb3_roles.prove.save_loops"
 ALGO, ENV = "hmappo", "area-search-v0"
 _DEADLINE, _TIMEOUT = 300.0, 3600.0
-_ALLOWED = 10.0
+_ATTEMPTS, _ALLOWED = 3, 10.0
 """Seconds from a signal to the end."""
 # How long after a phase was entered a signal comes, at most, in seconds: about as long as it takes.
 _WITHIN = {
@@ -104,10 +105,6 @@ def _counted(names: list[str]) -> str:
     return ", ".join(f"{n} in {name}" for name, n in sorted(Counter(names).items()))
 
 
-def _last_line(text: str) -> str:
-    return text.strip().splitlines()[-1] if text.strip() else "no message"
-
-
 # R1
 
 
@@ -127,25 +124,40 @@ def restarts(setting: Setting) -> Outcome:
     alone, killed = (
         Trainee(setting.folder / name, settings, *options) for name in ("alone", "killed")
     )
-    undisturbed = alone.start()
     hit: list[str] = []
     failures: list[str] = []
-    for phase in phases:
-        process = killed.start()
-        visits = int(rng.integers(1, 4)) if phase in kinds[1:] else 1
-        killed.wait_for(process, phase, visits, float(rng.uniform(0, _WITHIN[phase])))
-        ended = process.poll() is not None
-        processes.kill_session(process)
-        if ended:
-            failures.append(f"restart {len(hit) + 1} ended by itself, code {process.returncode}")
-            break
-        # Now that it is dead it can not go on to another one.
-        hit.append(killed.board.read().phase)
-        setting.note(f"killed in {hit[-1]}")
-    for one, process in ((killed, killed.start()), (alone, undisturbed)):
-        _, error = process.communicate(timeout=_DEADLINE)
-        if process.returncode:
-            failures.append(f"{one.folder.name}: code {process.returncode}: {_last_line(error)}")
+    with ExitStack() as stack:
+
+        def end(process: subprocess.Popen[str]) -> None:
+            # Of one that has ended long ago the number may be that of another by now.
+            if process.poll() is None:
+                processes.kill_session(process)
+
+        def started(trainee: Trainee) -> subprocess.Popen[str]:
+            process = trainee.start()
+            stack.callback(end, process)
+            return process
+
+        undisturbed = started(alone)
+        for phase in phases:
+            process = started(killed)
+            visits = int(rng.integers(1, 4)) if phase in kinds[1:] else 1
+            killed.wait_for(process, phase, visits, float(rng.uniform(0, _WITHIN[phase])))
+            ended = process.poll() is not None
+            processes.kill_session(process)
+            if ended:
+                failures.append(
+                    f"restart {len(hit) + 1} ended by itself, code {process.returncode}"
+                )
+                break
+            # Now that it is dead it can not go on to another one.
+            hit.append(killed.board.read().phase)
+            setting.note(f"killed in {hit[-1]}")
+        for one, process in ((killed, started(killed)), (alone, undisturbed)):
+            _, error = process.communicate(timeout=_TIMEOUT)
+            if process.returncode:
+                said = processes.last_line(error)
+                failures.append(f"{one.folder.name}: code {process.returncode}: {said}")
     if not failures:
         found = run_difference(alone.run, killed.run)
         failures += [] if found is None else [f"the runs differ in {found}"]
@@ -188,34 +200,46 @@ def terminations(setting: Setting) -> Outcome:
     hit, times, failures = [], [], []
     held = 0
     for i, (phase, number) in enumerate(zip(phases, numbers, strict=True)):
-        trainee = _terminee(setting.folder / f"trial_{i}", phase in long)
-        process = trainee.start()
+        for attempt in range(_ATTEMPTS):
+            trainee = _terminee(setting.folder / f"trial_{i}_{attempt}", phase in long)
+            where, seconds, problems = _terminated(trainee, phase, number, rng, phase in long)
+            trainee.board.close()
+            shutil.rmtree(trainee.folder)
+            if where is not None:
+                break
+            # Of a phase of milliseconds; that it was missed says nothing about the program.
+            problems = ["it ended before the signal"]
+        times.append(seconds)
+        hit.append(where or "nothing")
+        setting.note(f"{signal.Signals(number).name} in {where}: out in {seconds:.1f} s")
+        held += not problems
+        failures += [f"{signal.Signals(number).name} in {where}: {one}" for one in problems]
+    said = f"signals, out in at most {max(times):.1f} s ({_counted(hit)})"
+    return Outcome(held, len(phases), said, tuple(failures))
+
+
+def _terminated(
+    trainee: Trainee, phase: str, number: int, rng: np.random.Generator, long: bool
+) -> tuple[str | None, float, list[str]]:
+    """Send one signal; return where it came, None if too late, seconds to the end, problems."""
+    process = trainee.start()
+    try:
         visits = int(rng.integers(1, 3)) if phase == watched.SAVE else 1
-        within = _WITHIN[phase] if phase not in long else 2.0
+        within = 2.0 if long else _WITHIN[phase]
         where = trainee.wait_for(process, phase, visits, float(rng.uniform(0, within)))
         begun = time.monotonic()
         process.send_signal(number)
-        try:
-            _, error = process.communicate(timeout=_DEADLINE)
-        finally:
-            orphans = processes.left_behind(process)
-            processes.kill_session(process)
-        times.append(time.monotonic() - begun)
-        problems = _stopped_badly(trainee, process, number, error)
-        if where is None:
-            problems.append("it ended before the signal")
-        if times[-1] > _ALLOWED:
-            problems.append(f"took {times[-1]:.1f} s")
-        if orphans:
-            problems.append(f"left processes {orphans}")
-        hit.append(where or "nothing")
-        setting.note(f"{signal.Signals(number).name} in {where}: out in {times[-1]:.1f} s")
-        held += not problems
-        failures += [f"{signal.Signals(number).name} in {where}: {one}" for one in problems]
-        trainee.board.close()
-        shutil.rmtree(trainee.folder)
-    said = f"signals, out in at most {max(times):.1f} s ({_counted(hit)})"
-    return Outcome(held, len(phases), said, tuple(failures))
+        _, error = process.communicate(timeout=_DEADLINE)
+        seconds = time.monotonic() - begun
+        orphans = processes.left_behind(process)
+    finally:
+        processes.kill_session(process)
+    problems = _stopped_badly(trainee, process, number, error)
+    if seconds > _ALLOWED:
+        problems.append(f"took {seconds:.1f} s")
+    if orphans:
+        problems.append(f"left processes {orphans}")
+    return where, seconds, problems
 
 
 def _terminee(folder: Path, long: bool) -> Trainee:
@@ -234,13 +258,15 @@ def _stopped_badly(
     found = []
     run = trainee.run
     if process.returncode == -number:
-        # Before the program could handle signals; then nothing may be there.
-        if trainee.board.read().phase not in (IMPORT, BETWEEN):
+        # Before the program could handle signals, when nothing may be there, or when it was done.
+        phase = trainee.board.read().phase
+        done = phase == BETWEEN and run is not None and (run / SCORES_FILE).exists()
+        if phase != IMPORT and not done:
             found.append("died of the signal")
     elif process.returncode != 128 + number:
-        found.append(f"exit code {process.returncode}: {_last_line(error)}")
+        found.append(f"exit code {process.returncode}: {processes.last_line(error)}")
     elif len(error.splitlines()) > 1:
-        found.append(f"{len(error.splitlines())} lines: {_last_line(error)}")
+        found.append(f"{len(error.splitlines())} lines: {processes.last_line(error)}")
     partial = [path.name for path in trainee.folder.rglob("*.partial")]
     found += [f"left {name}" for name in partial]
     made = list(trainee.folder.glob(f"logs/{ALGO}/*"))
@@ -267,7 +293,7 @@ def saves(setting: Setting) -> Outcome:
     arguments = (setting.folder, str(setting.seed), str(n_trials))
     done = processes.finish(*arguments, cwd=setting.folder, timeout=_TIMEOUT, module=SAVE_LOOPS)
     if done.returncode:
-        return Outcome(0, n_trials, "the loops broke", (_last_line(done.stderr),))
+        return Outcome(0, n_trials, "the loops broke", (processes.last_line(done.stderr),))
     found = json.loads(done.stdout)
     said = f"kills survived, {found['inside']} of them with a file half written"
     return Outcome(

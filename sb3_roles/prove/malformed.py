@@ -90,8 +90,7 @@ def commands(setting: Setting) -> Outcome:
             if found:
                 failures.append(f"{case.name}: {'; '.join(found)}")
     stock, trusted = _stock(), _ours(NONSENSE)
-    if trusted:
-        failures.append(f"{', '.join(trusted)}: nonsense that ppo of this package takes")
+    failures += [f"{name}: nonsense that ppo of this package takes" for name in trusted]
     total = tried + len(NONSENSE)
     said = (
         f"malformed configurations and command lines and {len(NONSENSE)} nonsense settings: exit "

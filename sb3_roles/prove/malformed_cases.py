@@ -140,7 +140,7 @@ CONFIGURATIONS: tuple[Case, ...] = (
     _config("n_steps: 010", "line 1", "'010' is 8"),
     _config("n_envs: 2024-01-01", "line 1", "2024-01-01 is a date"),
     _config("gamma: 0.9, n_steps: 8, gamma: 0.8", "line 1", "'gamma' is given twice"),
-    _config(f"n_steps: {'9' * 5000}", "not valid YAML", "4300 digits"),
+    _config(f"n_steps: {'9' * 5000}", "not valid YAML", "a number of 5000 characters"),
     _config('policy: "\\e[31m\\nred"', "\\x1b[31m", "RolePolicy"),
     _file("default:\n\tn_steps: 8\n", "bad.yml", "line 2", "'\\t'"),
     _file("default:\n  n_timesteps: 9\n  n_steps: [8\n", "bad.yml", "line"),

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 _TIMEOUT = 600.0
 
@@ -93,13 +92,19 @@ def finish(
     :param timeout: seconds
     :param module: see :func:`words`
     :param variables: environment variables
-    :raises subprocess.TimeoutExpired: if it takes longer
+    :raises subprocess.TimeoutExpired: if it takes longer; nothing of it is left then
     """
-    options: dict[str, Any] = {"cwd": cwd, "env": environment(**variables), "timeout": timeout}
-    return subprocess.run(
-        words(*arguments, module=module),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        **options,
-    )
+    process = start(*arguments, cwd=cwd, module=module, **variables)
+    try:
+        out, error = process.communicate(timeout=timeout)
+    finally:
+        kill_session(process)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, error)
+
+
+def last_line(text: str) -> str:
+    """Return the last line of what a process said, which of a traceback is the error.
+
+    :param text: of stderr
+    """
+    return (text.strip().splitlines() or ["no message"])[-1]

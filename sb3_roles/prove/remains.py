@@ -55,16 +55,9 @@ def remains_of_checkpoint(checkpoint: Checkpoint) -> dict[str, str]:
     return {
         "weights": digest(checkpoint.policy),
         "optimizer": digest(checkpoint.optimizer),
-        "state": digest(without_times(_without_log_times(checkpoint.state))),
+        "state": digest(without_times(checkpoint.state)),
         "steps": digest(checkpoint.manifest["env_steps"]),
     }
-
-
-def _without_log_times(state: Mapping[str, Any]) -> dict[str, Any]:
-    # Whatever a log shows only later may hold times, too.
-    values = state["logger"]["values"]
-    plain = {key: one for key, one in values.items() if not key.startswith("time/")}
-    return {**state, "logger": {**state["logger"], "values": plain}}
 
 
 def remains_of_run(run: Path) -> dict[str, str]:

@@ -51,6 +51,8 @@ def killed_loop(save: Callable[[int], object], delay: float) -> int:
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
+        # So that it ends when this process is gone, and nobody reads what it writes.
+        os.close(reading)
         number = 0
         try:
             while True:

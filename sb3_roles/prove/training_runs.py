@@ -126,7 +126,10 @@ def train_here(
 
 def without_times(state: Mapping[str, Any]) -> dict[str, Any]:
     """Return a checkpoint's state without the seconds that were measured."""
-    return {key: value for key, value in state.items() if key != "elapsed_ns"}
+    # Whatever a log shows only later may hold times, too.
+    values = {k: v for k, v in state["logger"]["values"].items() if not k.startswith("time/")}
+    timeless = {key: value for key, value in state.items() if key != "elapsed_ns"}
+    return {**timeless, "logger": {**state["logger"], "values": values}}
 
 
 def untimed_rows(path: Path) -> list[list[str]]:
@@ -145,7 +148,8 @@ def untimed_rows(path: Path) -> list[list[str]]:
 def difference(a: Any, b: Any, where: str) -> str | None:
     """Return the place of the first difference of two trees of values and arrays; None for none.
 
-    Values are equal bit by bit: types, dtypes and shapes count, and a NaN is equal to a NaN.
+    Values are equal bit by bit: types, dtypes, shapes and signs of zeros count, and a NaN is equal
+    to the same NaN.
 
     :param a: dicts, lists, tensors, arrays and plain values
     :param b: the other one
@@ -164,7 +168,7 @@ def difference(a: Any, b: Any, where: str) -> str | None:
     elif isinstance(a, (np.ndarray, th.Tensor)):
         return None if _same_array(a, b) else where
     else:
-        return None if a == b or (a != a and b != b) else f"{where} ({a!r}, {b!r})"
+        return None if repr(a) == repr(b) else f"{where} ({a!r}, {b!r})"
     found = (difference(x, y, place) for place, x, y in pairs)
     return next((place for place in found if place is not None), None)
 
@@ -173,8 +177,10 @@ def _same_array(a: Any, b: Any) -> bool:
     if a.dtype != b.dtype or a.shape != b.shape:
         return False
     if isinstance(a, th.Tensor):
-        return th.equal(a, b)
-    return bool(np.array_equal(a, b, equal_nan=a.dtype.kind == "f"))
+        # As bytes: a tensor of bfloat16 is no array.
+        one, other = (t.cpu().contiguous().reshape(-1).view(th.uint8) for t in (a, b))
+        return th.equal(one, other)
+    return bool(a.tobytes() == b.tobytes())
 
 
 def checkpoint_difference(a: Checkpoint, b: Checkpoint) -> str | None:

@@ -90,12 +90,13 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
     # Before the folder is made: a wrong environment must leave nothing behind.
     env = make_env(config)
     try:
-        if job["resume"] is not None:
+        goes_on = job["resume"] is not None and _has_checkpoint(Path(job["resume"]))
+        if goes_on:
             check_run(config, env, Path(job["resume"]))
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
-        if options.get("strict_resume") and _has_checkpoint(Path(job["resume"])):
+        if options.get("strict_resume") and goes_on:
             # Before anything in the folder is touched, even its lock.
             folder = CheckpointFolder(Path(job["resume"]) / CHECKPOINTS)
             _note_inexact(_read_newest(folder, model, complete(config))[2], job)
@@ -173,6 +174,9 @@ def _train_in(
     config, options = complete(job["config"]), job["options"]
     checkpoints = CheckpointFolder(run / CHECKPOINTS)
     checkpoints.prepare()
+    if (run / BEST).is_symlink():
+        # As of checkpoints: a run folder must not choose where files are written.
+        raise UsageError(f"{run / BEST}: is a symbolic link, where a run has a folder: remove it")
     for folder in (run, run / BEST):
         remove_partial(folder)
     resume, begun = None, 0
@@ -241,6 +245,8 @@ def _train_in(
     print(f"{run}: {steps} joint steps; checkpoints: {len(checkpoints.paths())}", flush=True)
     stop.check()
     _evaluate(run, model, config, options["eval_episodes"])
+    # Of a signal that came while the scores were written: no other run shall begin.
+    stop.check()
     return 0
 
 

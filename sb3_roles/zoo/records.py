@@ -7,6 +7,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_roles.common.files import open_regular
 from sb3_roles.zoo.options import UsageError
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def run(args: Namespace) -> int:
 def _look_at(path: Path) -> None:
     """Refuse what is no Parquet file, before what reads one is imported."""
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             begins = file.read(len(_PARQUET))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror or error}") from None

@@ -180,12 +180,13 @@ def train(
     begun = model.num_timesteps // n_agents
     saved = None if resume is None else begun
     boundary: _Boundary | None = None
+    facts = machine_facts(model)
 
     def take() -> _Boundary:
         env_steps = model.num_timesteps // n_agents
         manifest = {
             "config": dict(config or {}),
-            "machine": machine_facts(model),
+            "machine": facts,
             "env_steps": env_steps,
             "agent_steps": model.num_timesteps,
         }
