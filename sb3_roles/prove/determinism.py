@@ -85,7 +85,8 @@ def commands(algos: list[str]) -> None:
     """
     from sb3_roles.zoo.cli import main
 
-    here, digests = Path(), {}
+    here = Path()
+    digests: dict[str, str] = {}
     for algo in algos:
         conf = here / f"{algo}.yml"
         write_yaml(conf, {_ENV: small_settings(algo, 3)})
