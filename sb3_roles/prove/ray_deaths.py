@@ -84,7 +84,7 @@ class DeadlyPlayer(RayPlayer):
         self, learner: Learner, config: Mapping[str, Any], n_workers: int, markers: Path
     ) -> None:
         super().__init__(learner, config, n_workers)
-        self._deadly: Any = the_ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(play_and_die)
+        self._play_and_die = the_ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(play_and_die)
         self._markers, self._round = markers, 0
 
     def run(
@@ -97,7 +97,9 @@ class DeadlyPlayer(RayPlayer):
     def submit(self, task: GroupTask, weights: Any, n_threads: int) -> Any:
         """Send one task."""
         marker = self._markers / f"round_{self._round}"
-        return self._deadly.remote(self._config, os.getcwd(), task, weights, n_threads, marker)
+        return self._play_and_die.remote(
+            self._config, os.getcwd(), task, weights, n_threads, marker
+        )
 
 
 def training_trials(setting: Setting) -> list[Trial]:
