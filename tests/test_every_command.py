@@ -11,7 +11,7 @@ from importlib import import_module
 import pytest
 import yaml
 
-from sb3_roles.common import checkpoint
+from sb3_roles.common import checkpoint, checkpoint_reading
 from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.evaluation import records
 from sb3_roles.gnn import demonstrations
@@ -135,7 +135,9 @@ def later(run, monkeypatch):
     for path in CheckpointFolder(run / "checkpoints").paths():
         found = checkpoint.read_checkpoint(path)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(checkpoint, "FORMAT_VERSION", checkpoint.FORMAT_VERSION + 1)
+            # Those that write check what they have written.
+            for module in (checkpoint, checkpoint_reading):
+                patch.setattr(module, "FORMAT_VERSION", checkpoint.FORMAT_VERSION + 1)
             checkpoint.write_checkpoint(path, {}, found.policy, found.optimizer, found.state)
     return run
 

@@ -413,6 +413,8 @@ class MAPPO(OnPolicyAlgorithm):
             # The sum of squares, which is computed to clip anyway, tells it.
             th.nn.utils.clip_grad_norm_(self.policy.parameters(), limit, error_if_nonfinite=True)
         except RuntimeError as error:
+            if "non-finite" not in str(error):
+                raise
             raise gradient_error(self.policy) from error
         self.policy.optimizer.step()
 

@@ -82,8 +82,8 @@ def _problem(path: Path, written: Checkpoint) -> str | None:
 
 def _same(one: Checkpoint, other: Checkpoint) -> bool:
     """Whether two checkpoints are the same in every bit, with their times."""
-    parts = ((c.manifest, c.policy, c.optimizer, c.state) for c in (one, other))
-    return difference(*parts, "checkpoint") is None
+    a, b = ([c.manifest, c.policy, c.optimizer, c.state] for c in (one, other))
+    return difference(a, b, "checkpoint") is None
 
 
 def sound_files(folder: Path) -> dict[str, list[Path]]:

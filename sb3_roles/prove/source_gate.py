@@ -24,6 +24,11 @@ ALLOWED: Mapping[tuple[str, str], str] = MappingProxyType(
         ("sb3_roles/__init__.py", "import_module"): OF_CONSTANTS,
         ("sb3_roles/baselines/__init__.py", "import_module"): OF_CONSTANTS,
         ("sb3_roles/prove/promises.py", "import_module"): OF_CONSTANTS,
+        ("sb3_roles/testing/__init__.py", "import_module"): OF_CONSTANTS,
+        (
+            "sb3_roles/testing/seeds.py",
+            "import_module",
+        ): "the environment that a caller of check_fresh_process gives, by name, to its child",
         ("sb3_roles/zoo/algorithms.py", "import_module"): OF_CONSTANTS,
         ("sb3_roles/zoo/bench.py", "import_module"): OF_CONSTANTS,
         ("sb3_roles/zoo/cli.py", "import_module"): OF_CONSTANTS,

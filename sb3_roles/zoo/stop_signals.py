@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -12,6 +13,9 @@ from sb3_roles.common.files import is_writing
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STDERR = 2
+# Seconds within which a second signal is the first one's: timeout, srun and some terminals signal a
+# process and its group.
+_SAME_STOP = 0.3
 
 
 class StopSignals:
@@ -27,6 +31,7 @@ class StopSignals:
         self.message = ""
         """to print when the first signal comes, for what may take a moment"""
         self._held = 0
+        self._when = 0.0
 
     @contextmanager
     def caught(self) -> Iterator[StopSignals]:
@@ -36,7 +41,8 @@ class StopSignals:
             yield self
         finally:
             for number, handler in zip(_SIGNALS, earlier, strict=True):
-                signal.signal(number, handler)
+                # None stands for one that was set by C.
+                signal.signal(number, handler or signal.SIG_DFL)
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -66,9 +72,12 @@ class StopSignals:
             raise KeyboardInterrupt
 
     def _note(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
         if self.received is not None:
+            if now - self._when < _SAME_STOP:
+                return
             raise SystemExit(128 + number)
-        self.received = number
+        self.received, self._when = number, now
         if self.message:
             # Not print: this may have interrupted it.
             with suppress(OSError):

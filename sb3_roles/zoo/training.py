@@ -18,6 +18,7 @@ from sb3_roles.common import snapshot
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
 from sb3_roles.common.facts import machine_facts
 from sb3_roles.common.files import append, csv_bytes, open_regular, write_atomically
+from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.zoo.stop_signals import StopSignals
 
@@ -226,6 +227,11 @@ def train(
         if saved != boundary.env_steps:
             save(boundary)
         env_steps = boundary.env_steps
+    except RolloutsLost:
+        # The cluster is gone, the run is not.
+        if boundary is not None and saved != boundary.env_steps:
+            save(boundary)
+        raise
     else:
         env_steps = model.num_timesteps // n_agents
     stop.message = ""
