@@ -146,12 +146,12 @@ def note_command(run: Path, command: Sequence[str]) -> None:
     :param run: the run folder
     :param command: the command line
     """
+    _refuse_link(run / COMMAND_FILE)
     commit = source_commit(Path(__file__)) or "null"
     lines = [shlex.join(command), f"# sb3_roles {__version__}, commit {commit}"]
     versions = [f"{name} {version_of(name)}" for name in PACKAGES]
     lines.append(f"# python {sys.version.split()[0]}, " + ", ".join(versions))
     lines.append(f"# {process_settings()}")
-    _refuse_link(run / COMMAND_FILE)
     append(run / COMMAND_FILE, ("\n".join(lines) + "\n").encode())
 
 
