@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.gnn import recording
 from sb3_roles.gnn.gnn import GNN
+from sb3_roles.prove import processes
 from sb3_roles.prove.kills import run_difference
 from sb3_roles.prove.small_runs import ITERATION, small_settings
 from sb3_roles.zoo import job, training
@@ -243,3 +246,33 @@ def test_a_signal_stops_a_recording_which_goes_on(tmp_path, monkeypatch, capfd):
     assert main(["--resume", str(run), "--verbose", "0"], "train") == 0
     assert (run / "demonstrations.yml").exists()
     assert GNN.__name__ in repr(load_model(run))
+
+
+def test_while_torch_is_imported_a_signal_ends_the_process_on_the_spot(tmp_path):
+    # What is imported swallows whatever is raised in it, as some packages do.
+    code = """
+import os, signal, sys
+from sb3_roles.zoo import cli, train
+
+class Finder:
+    def find_spec(self, name, path, target=None):
+        if name == "torch":
+            try:
+                os.kill(os.getpid(), signal.SIGTERM)
+                for _ in range(10):
+                    pass
+            except BaseException:
+                pass
+
+sys.meta_path.insert(0, Finder())
+sys.exit(cli.main(sys.argv[1:], "train"))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--algo", "mappo", "-f", str(tmp_path / "logs")],
+        env=processes.environment(),
+        capture_output=True,
+        text=True,
+    )
+    said = (done.returncode, done.stdout, done.stderr)
+    assert said == (143, "", "train.py: stopped before a run was begun\n")
+    assert not (tmp_path / "logs").exists()

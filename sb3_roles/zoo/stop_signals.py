@@ -32,6 +32,7 @@ class StopSignals:
         """to print when the first signal comes, for what may take a moment"""
         self._held = 0
         self._when = 0.0
+        self._at_once = ""
 
     @contextmanager
     def caught(self) -> Iterator[StopSignals]:
@@ -43,6 +44,20 @@ class StopSignals:
             for number, handler in zip(_SIGNALS, earlier, strict=True):
                 # None stands for one that was set by C.
                 signal.signal(number, handler or signal.SIG_DFL)
+
+    @contextmanager
+    def at_once(self, message: str) -> Iterator[None]:
+        """Let a signal end the process on the spot, while there is nothing to be cleaned up.
+
+        For imports: some of them swallow whatever is raised, and go on.
+
+        :param message: last line of the process
+        """
+        self._at_once = message
+        try:
+            yield
+        finally:
+            self._at_once = ""
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
@@ -78,10 +93,13 @@ class StopSignals:
                 return
             raise SystemExit(128 + number)
         self.received, self._when = number, now
-        if self.message:
+        message = self._at_once or self.message
+        if message:
             # Not print: this may have interrupted it.
             with suppress(OSError):
-                os.write(_STDERR, f"{self.message}\n".encode())
+                os.write(_STDERR, f"{message}\n".encode())
+        if self._at_once:
+            os._exit(self.exit_code)
         if not self._held and not is_writing(frame):
             raise KeyboardInterrupt
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from sb3_roles.zoo.options import Subparsers
 
 EXIT_ERROR, EXIT_DIVERGED = 2, 3
+_NOT_BEGUN = "stopped before a run was begun"
 _DESCRIPTION = (
     "Train an algorithm in a new run folder <logs>/<algo>/<env>_<i>, or resume a run. Steps are "
     "joint steps: one of a whole team."
@@ -149,7 +150,7 @@ def run(args: argparse.Namespace) -> int:
         with stop.caught():
             return _run(args, stop)
     except KeyboardInterrupt:
-        print(f"{args.parser.prog}: stopped before a run was begun", file=sys.stderr)
+        print(f"{args.parser.prog}: {_NOT_BEGUN}", file=sys.stderr)
         return stop.exit_code
 
 
@@ -168,11 +169,12 @@ def _run(args: argparse.Namespace, stop: StopSignals) -> int:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
         return EXIT_ERROR
-    prepare_process()
+    with stop.at_once(f"{args.parser.prog}: {_NOT_BEGUN}"):
+        prepare_process()
+        from sb3_roles.zoo.job import TrainingFailed, run_job
+
     if len(jobs) > 1 and "ray" in given:
         return _fan_out(args, runs, jobs[0]["options"], stop)
-    from sb3_roles.zoo.job import TrainingFailed, run_job
-
     try:
         for job in jobs:
             code = run_job(job, stop)
