@@ -13,14 +13,10 @@ import numpy as np
 
 from sb3_roles.baselines import controller_class
 from sb3_roles.baselines.random import RandomController
-from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.evaluation.grid.entrants import Entrant, Results
 from sb3_roles.evaluation.grid.plan import Plan
 from sb3_roles.evaluation.grid.plan_file import parse_plan
 from sb3_roles.evaluation.records import TIMINGS, EpisodeRecords
-from sb3_roles.zoo.config import write_yaml
-from sb3_roles.zoo.models import complete
-from sb3_roles.zoo.row_configs import config_of_row
 
 # A training of a moment, beside its own defaults.
 TINY = {
@@ -71,6 +67,12 @@ def scripted(plan: Plan) -> dict[str, list[Entrant]]:
 
 def make_run(logs: Path, row: Any, number: int, steps: int, seed: int, **changes: Any) -> Path:
     """Write what the finder reads of a run; its weights fit nothing."""
+    # Processes that play import this module, too, and need none of these.
+    from sb3_roles.common.checkpoint import CheckpointFolder
+    from sb3_roles.zoo.config import write_yaml
+    from sb3_roles.zoo.models import complete
+    from sb3_roles.zoo.row_configs import config_of_row
+
     run = logs / row.algo / f"area-search-v0_{number}"
     config = {**complete(config_of_row(row)), "seed": seed, "n_timesteps": 500, **changes}
     run.mkdir(parents=True)

@@ -6,6 +6,7 @@ import csv
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,7 @@ def test_the_reference_plays_with_roles_that_are_not_its_own():
     assert changes_of(one, found.variants["base"]) == "roles while playing: explore"
 
 
+@cache
 def shipped() -> Ablations:
     return parse_ablations(read_yaml(config_file("ablations")))
 

@@ -198,7 +198,7 @@ class SignalEnv(ParallelEnv):
         return self.observe(), rewards, dict.fromkeys(self.agents, False), over, infos
 
 
-def success(model, env, n_steps=200):
+def success(model, env, n_steps=50):
     """Mean reward; 1 is perfect, a uniform choice among three moves has 1 / 3."""
     observations, total = env.reset(), 0.0
     for _ in range(n_steps):

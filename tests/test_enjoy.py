@@ -237,7 +237,7 @@ WRONG = [
     (["enjoy", "-f", "LOGS", "--exp-id", "7"], "no run 7"),
     (["enjoy", "-f", "LOGS", "--exp-id", "-1"], "--exp-id"),
     (["enjoy", "-f", "LOGS", "--video", "x.avi"], ".mp4 or .gif"),
-    (["enjoy", "-f", "LOGS", "--video", "/nowhere/x.gif"], "'/nowhere'"),
+    (["enjoy", "-f", "LOGS", "--video", "nowhere/x.gif"], "'nowhere'"),
     (["enjoy", "-f", "LOGS", "--scene", "hrad"], "did you mean 'hard'"),
     (["enjoy", "-f", "LOGS", "--n-agents", "0"], "got 0"),
     (["enjoy", "-f", "LOGS", "--env-kwargs", "horizn:4"], "horizon"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import multiprocessing
 import os
 import signal
 import threading
@@ -392,6 +393,10 @@ def test_a_worker_with_another_controller_is_refused(store):
 
 def test_processes_play_what_one_process_plays_and_may_be_killed(tmp_path, monkeypatch):
     """One controller kills its process once, and one whenever it plays."""
+    # Copies of one that has imported what all of them need; tables are played by fresh ones.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["grids", "sb3_roles.evaluation.grid.processes"])
+    monkeypatch.setattr(processes.multiprocessing, "get_context", lambda how: context)
     monkeypatch.setattr(processes, "MAX_TRIES", 2)
     plan = small_plan(("random", "greedy", "once", "always"))
     marker = tmp_path / "killed"
