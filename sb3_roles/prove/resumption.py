@@ -167,7 +167,9 @@ def cuts(setting: Setting) -> Outcome:
         setting.note(f"{i + 1} of {len(cases)}: {case.name}")
         broken = try_case(case, setting.folder / str(i), n_iterations, after, setting.seed)
         held += len(after) - len(broken)
-        failures += [f"{case.name}, cut after {cut}: {why}" for cut, why in broken.items()]
+        for cut, why in broken.items():
+            failures.append(f"{case.name}, cut after {cut}: {why} is not that of the straight run")
+            setting.note(failures[-1])
     algos = len({case.algo for case in cases})
     alone = ", ".join(name for name in ALGORITHMS if not precisions(name)[0])
     said = (
