@@ -136,8 +136,9 @@ def later(run, monkeypatch):
         found = checkpoint.read_checkpoint(path)
         with pytest.MonkeyPatch.context() as patch:
             # Those that write check what they have written.
+            later = checkpoint.FORMAT_VERSION + 1
             for module in (checkpoint, checkpoint_reading):
-                patch.setattr(module, "FORMAT_VERSION", checkpoint.FORMAT_VERSION + 1)
+                patch.setattr(module, "FORMAT_VERSION", later)
             checkpoint.write_checkpoint(path, {}, found.policy, found.optimizer, found.state)
     return run
 

@@ -18,7 +18,7 @@ from sb3_roles.gnn.gnn import GNN
 from sb3_roles.prove import processes
 from sb3_roles.prove.kills import run_difference
 from sb3_roles.prove.small_runs import ITERATION, small_settings
-from sb3_roles.zoo import job, training
+from sb3_roles.zoo import job, stop_signals, training
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import write_yaml
@@ -139,13 +139,25 @@ def test_a_signal_while_a_file_is_replaced_waits_for_it(tmp_path, monkeypatch):
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
 
 
-def test_the_second_signal_ends_at_once():
+def test_the_second_signal_ends_at_once(monkeypatch):
     stop = StopSignals()
+    monkeypatch.setattr(stop_signals, "_SAME_STOP", 0.0)
     with pytest.raises(SystemExit) as end, stop.caught(), stop.held():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)
         pytest.fail("it goes on")
     assert end.value.code == 130
+
+
+def test_a_signal_that_comes_twice_at_once_is_one():
+    stop = StopSignals()
+    seen = []
+    with pytest.raises(KeyboardInterrupt), stop.caught(), stop.held():
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGTERM)
+            seen.append(stop.received)
+    assert seen == [signal.SIGTERM] * 3
+    assert stop.exit_code == 143
 
 
 def test_signals_are_handled_as_before_afterwards():
