@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from typing import Any
 
 import pytest
 
@@ -15,9 +16,21 @@ from sb3_roles.zoo.bench_options import Change
 from sb3_roles.zoo.cli import main
 
 SHORT = ["--n-envs", "2", "--iterations", "1", "--repeats", "2"]
+N_STEPS = 5
 
 
-def test_growth_is_reported_and_drawn(capsys, tmp_path):
+@pytest.fixture
+def brief(monkeypatch):
+    """Short rollouts."""
+
+    def configured(changes: dict[str, Any] | None = None, n_envs: int | None = None) -> Any:
+        return configure(changes={"n_steps": N_STEPS, **(changes or {})}, n_envs=n_envs)
+
+    for module in (bench_growth, bench_options):
+        monkeypatch.setattr(module, "configure", configured)
+
+
+def test_growth_is_reported_and_drawn(capsys, tmp_path, brief):
     plot = tmp_path / "growth.svg"
     options = ["--robots", "3,2", "--sides", "25,11,27", "--plot", str(plot), "--json"]
     assert main(["bench", "growth", *SHORT, *options]) == 0
@@ -26,7 +39,7 @@ def test_growth_is_reported_and_drawn(capsys, tmp_path):
     assert sizes == [(2, 11), (3, 11), (2, 25), (2, 27)]
     for case in report["cases"]:
         assert case["n_teams"] == 2
-        assert case["work"]["joint_steps"] == 2 * 2 * configure()["n_steps"]
+        assert case["work"]["joint_steps"] == 2 * 2 * N_STEPS
         for cost in case["microseconds"].values():
             assert 0 < cost["min"] <= cost["median"] <= cost["max"]
         # What update and rollout cost is what a joint step costs.
@@ -46,7 +59,7 @@ def test_growth_is_reported_and_drawn(capsys, tmp_path):
         assert text in drawn
 
 
-def test_growth_tables(capsys):
+def test_growth_tables(capsys, brief):
     options = ["--robots", "2,3", "--sides", "11,12", "--markdown"]
     assert main(["bench", "growth", *SHORT, *options]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -69,7 +82,7 @@ def test_rollouts_that_do_not_fit_have_fewer_teams(monkeypatch):
         assert fitted["batch_size"] == min(config["batch_size"], teams * config["n_steps"])
 
 
-def test_options_are_compared_with_what_differs_in_them_alone(capsys, monkeypatch):
+def test_options_are_compared_with_what_differs_in_them_alone(capsys, monkeypatch, brief):
     names = ["norm_layer frozen_batch", "n_epochs 1", "num_threads 1", "the same"]
     default = configure()
     monkeypatch.setitem(bench_options.CHANGES, "the same", Change({"gamma": default["gamma"]}))
