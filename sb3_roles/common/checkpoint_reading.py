@@ -17,7 +17,7 @@ import safetensors.torch
 import torch as th
 
 from sb3_roles.common.files import open_regular
-from sb3_roles.common.names import one_line
+from sb3_roles.common.names import one_line, shown
 from sb3_roles.common.plain_tree import decode_tree, parse_json
 from sb3_roles.common.stored_zip import (
     MAX_BYTES,
@@ -122,8 +122,8 @@ def read_manifest(path: Path, file: IO[bytes], found: Mapping[str, Member]) -> d
         raise CheckpointError(f"{path}: no checkpoint of sb3_roles")
     if manifest.get("format_version") != FORMAT_VERSION:
         raise CheckpointError(
-            f"{path}: format version {str(manifest.get('format_version'))[:40]!r}, this program "
-            f"reads {FORMAT_VERSION}"
+            f"{path}: format version {shown(manifest.get('format_version'))}, this program reads "
+            f"{FORMAT_VERSION}"
         )
     # Files of earlier releases do not vouch for their manifest.
     if manifest.get(SUM, sum_of(manifest)) != sum_of(manifest):
