@@ -21,10 +21,9 @@ from sb3_roles.prove.small_runs import ITERATION, small_settings
 from sb3_roles.prove.training_runs import checkpoint_difference, log_difference
 from sb3_roles.prove.watched import BETWEEN, IMPORT, START, Board
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
-from sb3_roles.zoo.job import SCORES_FILE
 from sb3_roles.zoo.models import load_model
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS
+from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS, SCORES_FILE
 
 WATCHED = "sb3_roles.prove.watched"
 SAVE_LOOPS = "sb3_roles.prove.save_loops"

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +20,7 @@ from stable_baselines3.common.logger import (
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
-from sb3_roles.common.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
-from sb3_roles.common.checkpoint_fit import check_outline
-from sb3_roles.common.env_state import env_gap
-from sb3_roles.common.facts import differences, machine_facts
+from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
 from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
@@ -40,15 +35,17 @@ from sb3_roles.evaluation.evaluators import (
     scenes_evaluator,
 )
 from sb3_roles.zoo.algorithms import get_algorithm
-from sb3_roles.zoo.config import CONFIG_FILE, plain, write_yaml
-from sb3_roles.zoo.environments import AREA_SEARCH, ENVIRONMENTS, folder_name, scenes_of_run
+from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
+from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
-from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model, steps_of
+from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ray_options import rollouts_on_ray
+from sb3_roles.zoo.resumption import has_checkpoint, note_inexact, read_newest
 from sb3_roles.zoo.run_folder import (
     BEST,
     CHECKPOINTS,
+    SCORES_FILE,
     RunLock,
     new_run,
     note_command,
@@ -60,7 +57,6 @@ from sb3_roles.zoo.training import CsvLog, train
 # The periodic evaluation selects the best policy, on a stream that no --seed of a command reaches.
 _SELECTION_SEED, _FINAL_SEED = 0, 1
 _MAX_EVAL_TEAMS = 8
-SCORES_FILE = "evaluation.yml"
 
 
 class TrainingFailed(Exception):
@@ -90,7 +86,7 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
     # Before the folder is made: a wrong environment must leave nothing behind.
     env = make_env(config)
     try:
-        goes_on = job["resume"] is not None and _has_checkpoint(Path(job["resume"]))
+        goes_on = job["resume"] is not None and has_checkpoint(Path(job["resume"]))
         if goes_on:
             check_run(config, env, Path(job["resume"]))
         model = make_model(config, env, options["device"])
@@ -99,7 +95,7 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
         if options.get("strict_resume") and goes_on:
             # Before anything in the folder is touched, even its lock.
             folder = CheckpointFolder(Path(job["resume"]) / CHECKPOINTS)
-            _note_inexact(_read_newest(folder, model, complete(config))[2], job)
+            note_inexact(read_newest(folder, model, complete(config))[2], job)
         # Ray has a handler of its own.
         with rollouts_on_ray(model, config, options), stop.caught():
             with stop.waiting():
@@ -163,11 +159,6 @@ def _command(job: Mapping[str, Any]) -> list[str]:
     return list(job.get("command") or [Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def _has_checkpoint(run: Path) -> bool:
-    """Whether a run has one, or had: what was evaluated had, and has lost it."""
-    return bool(CheckpointFolder(run / CHECKPOINTS).paths()) or (run / SCORES_FILE).exists()
-
-
 def _train_in(
     run: Path, model: OnPolicyAlgorithm, job: Mapping[str, Any], stop: StopSignals
 ) -> int:
@@ -180,11 +171,11 @@ def _train_in(
     for folder in (run, run / BEST):
         remove_partial(folder)
     resume, begun = None, 0
-    if job["resume"] is not None and not _has_checkpoint(run):
+    if job["resume"] is not None and not has_checkpoint(run):
         print(f"{run} has no checkpoint yet: it begins anew", flush=True)
     elif job["resume"] is not None:
-        resume, begun, reasons = _read_newest(checkpoints, model, config)
-        _note_inexact(reasons, job)
+        resume, begun, reasons = read_newest(checkpoints, model, config)
+        note_inexact(reasons, job)
         if options.get("n_timesteps", begun) < begun:
             wanted = options["n_timesteps"]
             raise UsageError(f"{run} has {begun} joint steps already, more than -n {wanted}")
@@ -307,44 +298,6 @@ def with_state(log: CsvLog, callbacks: Sequence[Any], model: OnPolicyAlgorithm) 
     :param model: an algorithm may know more than weights and counters
     """
     return [log, *callbacks, *([model] if hasattr(model, "get_state") else [])]
-
-
-def _read_newest(
-    checkpoints: CheckpointFolder, model: OnPolicyAlgorithm, config: Mapping[str, Any]
-) -> tuple[Checkpoint, int, list[str]]:
-    """Read where a run was; nothing is written.
-
-    :return: the checkpoint, its joint steps, and what may keep it from going on bit for bit
-    """
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            own = config["env"] not in ENVIRONMENTS
-            # The state of anybody's own environment, whose code the user named, may have any size.
-            check = None if own else partial(check_outline, model)
-            _, checkpoint = checkpoints.newest(check)
-        begun = steps_of(checkpoint, "env_steps")
-    except CheckpointError as error:
-        raise UsageError(str(error)) from error
-    for warning in caught:
-        print(f"warning: {warning.message}", flush=True)
-    assert model.env is not None
-    machine, trained = (checkpoint.manifest.get(name) for name in ("machine", "config"))
-    reasons = differences(machine if isinstance(machine, dict) else {}, machine_facts(model))
-    gap = env_gap(model.env)
-    reasons += [] if gap is None else [gap]
-    reasons += differences(trained if isinstance(trained, dict) else {}, plain(config))
-    return checkpoint, begun, [" ".join(reason.split()) for reason in reasons]
-
-
-def _note_inexact(reasons: Sequence[str], job: Mapping[str, Any]) -> None:
-    """Say, or refuse, what may keep a run from going on bit for bit."""
-    if not reasons:
-        return
-    text = f"not bit-exact: {'; '.join(reasons)}"
-    if job["options"].get("strict_resume"):
-        raise UsageError(f"--strict-resume: {job['resume']}: {text}")
-    print(text, flush=True)
 
 
 def _logger(

@@ -21,6 +21,7 @@ from sb3_roles.zoo.options import UsageError
 
 ARGS_FILE, COMMAND_FILE, LOCK_FILE = "args.yml", "command.txt", "lock"
 CHECKPOINTS, BEST = "checkpoints", "best"
+SCORES_FILE = "evaluation.yml"
 
 
 def _numbered(folder: Path, env: str) -> dict[int, Path]:
