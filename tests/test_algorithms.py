@@ -40,7 +40,7 @@ from sb3_roles.zoo.models import make_model as make_zoo_model
 
 OURS = {"mappo": (MAPPO, "TeamPolicy", SMALL_TEAM), "hmappo": (HMAPPO, "RolePolicy", SMALL_ROLE)}
 STOCK = {
-    "ppo": (PPO, {"n_steps": 10, "batch_size": 30}),
+    "ppo": (PPO, {"n_steps": 10, "batch_size": 30, "n_epochs": 2}),
     "a2c": (A2C, {"n_steps": 10}),
     "trpo": (
         TRPO,
@@ -476,7 +476,8 @@ SMALL_SCENE = {"height": 9, "width": 9, "n_targets": 10, "horizon": 12, "n_agent
 
 def registered(algo, env="area-search-v0", **settings):
     """A small untrained model of the registry, and its configuration."""
-    settings = {"n_timesteps": 100, "n_envs": 2, "n_steps": 4, "batch_size": 4, **settings}
+    defaults = {"n_timesteps": 100, "n_envs": 2, "n_steps": 4, "batch_size": 4, "n_epochs": 2}
+    settings = {**defaults, **settings}
     if env == "area-search-v0":
         settings["env_kwargs"] = SMALL_SCENE
     config = resolve(algo, env, settings, seed=0)

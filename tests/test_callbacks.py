@@ -52,7 +52,8 @@ def make_model(algo=HMAPPO, n_envs=N_TEAMS, n_steps=HORIZON, wrapper=None, env=N
     from sb3_roles.hmappo.policies import RoleActorCriticPolicy
 
     extra = {} if algo is A2C else {"batch_size": rows}
-    extra |= {"sub_sampling_factor": 1} if algo is TRPO else {}
+    extra |= {"sub_sampling_factor": 1, "n_critic_updates": 1} if algo is TRPO else {}
+    extra |= {"n_epochs": 1} if algo is PPO else {}
     return algo(
         RoleActorCriticPolicy, venv, rollout_buffer_class=TeamRolloutBuffer, **extra, **common
     )
