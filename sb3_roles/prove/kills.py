@@ -188,7 +188,7 @@ def terminations(setting: Setting) -> Outcome:
     hit, times, failures = [], [], []
     held = 0
     for i, (phase, number) in enumerate(zip(phases, numbers, strict=True)):
-        trainee = _terminee(setting.folder / f"trial_{i}", phase in long)
+        trainee = _terminee(setting.folder / f"trial_{i}", phase, phase in long)
         process = trainee.start()
         visits = int(rng.integers(1, 3)) if phase == watched.SAVE else 1
         within = _WITHIN[phase] if phase not in long else 2.0
@@ -218,12 +218,13 @@ def terminations(setting: Setting) -> Outcome:
     return Outcome(held, len(phases), said, tuple(failures))
 
 
-def _terminee(folder: Path, long: bool) -> Trainee:
+def _terminee(folder: Path, phase: str, long: bool) -> Trainee:
     """Make a run whose first iteration takes much longer than is allowed, or one of short ones."""
     if long:
         settings = small_settings(ALGO, 500, n_steps=400, n_epochs=50)
         return Trainee(folder, settings, "--eval-freq", "0")
-    options = ["--save-freq", str(ITERATION), "--eval-freq", str(ITERATION)]
+    eval_freq = ITERATION if phase == watched.EVALUATION else 0
+    options = ["--save-freq", str(ITERATION), "--eval-freq", str(eval_freq)]
     return Trainee(folder, small_settings(ALGO, 3), *options, "--eval-episodes", "60")
 
 
