@@ -200,7 +200,7 @@ def terminations(setting: Setting) -> Outcome:
     held = 0
     for i, (phase, number) in enumerate(zip(phases, numbers, strict=True)):
         for attempt in range(_ATTEMPTS):
-            trainee = _terminee(setting.folder / f"trial_{i}_{attempt}", phase in long)
+            trainee = _terminee(setting.folder / f"trial_{i}_{attempt}", phase, phase in long)
             where, seconds, problems = _terminated(trainee, phase, number, rng, phase in long)
             trainee.board.close()
             shutil.rmtree(trainee.folder)
@@ -241,12 +241,13 @@ def _terminated(
     return where, seconds, problems
 
 
-def _terminee(folder: Path, long: bool) -> Trainee:
+def _terminee(folder: Path, phase: str, long: bool) -> Trainee:
     """Make a run whose first iteration takes much longer than is allowed, or one of short ones."""
     if long:
         settings = small_settings(ALGO, 500, n_steps=400, n_epochs=50)
         return Trainee(folder, settings, "--eval-freq", "0")
-    options = ["--save-freq", str(ITERATION), "--eval-freq", str(ITERATION)]
+    eval_freq = ITERATION if phase == watched.EVALUATION else 0
+    options = ["--save-freq", str(ITERATION), "--eval-freq", str(eval_freq)]
     return Trainee(folder, small_settings(ALGO, 3), *options, "--eval-episodes", "60")
 
 
