@@ -21,7 +21,7 @@ def results_page(
     :param quick: whether these are the short forms
     """
     form = "short forms: fewer trials than the targets name" if quick else "full forms"
-    table = Table(_COLUMNS)
+    table = Table(_COLUMNS, n_texts=len(_COLUMNS) - 1)
     failures = []
     for promise, outcome, seconds in results:
         seen = f"{outcome.held}/{outcome.tried} {outcome.said}"

@@ -76,14 +76,16 @@ def range_text(found: dict[str, Any], style: str) -> str:
 
 @dataclass
 class Table:
-    """A table for people: the first column is text, the others are set to the right.
+    """A table for people: the first columns are text, the others are set to the right.
 
     :param columns: headings
     :param rows: as many cells each
+    :param n_texts: number of the columns of text
     """
 
     columns: Sequence[str]
     rows: list[Sequence[str]] = field(default_factory=list)
+    n_texts: int = 1
 
     def add(self, *row: str) -> None:
         """Add a row."""
@@ -97,14 +99,14 @@ class Table:
         :param markdown: with bars between the cells
         """
         if markdown:
-            rule = ["---", *["---:"] * (len(self.columns) - 1)]
+            rule = ["---" if k < self.n_texts else "---:" for k in range(len(self.columns))]
             # "..." stays text, a bar would end the cell.
             rows = [[cell.replace("|", "\\|") for cell in row] for row in self.rows]
             return [f"| {' | '.join(row)} |" for row in (self.columns, rule, *rows)]
         widths = [max(map(len, column)) for column in zip(self.columns, *self.rows, strict=True)]
         return [
             "  ".join(
-                cell.ljust(width) if k == 0 else cell.rjust(width)
+                cell.ljust(width) if k < self.n_texts else cell.rjust(width)
                 for k, (cell, width) in enumerate(zip(row, widths, strict=True))
             ).rstrip()
             for row in (self.columns, *self.rows)
