@@ -17,6 +17,7 @@ from sb3_roles.prove.promises import Setting
 from sb3_roles.prove.small_runs import ITERATION, small_settings
 from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.run_folder import CHECKPOINTS
 
 
@@ -24,11 +25,11 @@ from sb3_roles.zoo.run_folder import CHECKPOINTS
 def finished(tmp_path_factory):
     """The folder of a run of two iterations."""
     folder = tmp_path_factory.mktemp("runs")
-    write_yaml(folder / "given.yml", {kills.ENV: small_settings(kills.ALGO, 2)})
+    write_yaml(folder / "given.yml", {AREA_SEARCH: small_settings(kills.ALGO, 2)})
     words = ["--algo", kills.ALGO, "-conf", str(folder / "given.yml"), "-f", str(folder / "logs")]
     words += ["--eval-freq", str(ITERATION), "--eval-episodes", "2", "--save-freq", str(ITERATION)]
     assert main([*words, "--num-threads", "1", "--device", "cpu", "--verbose", "0"], "train") == 0
-    return folder / "logs" / kills.ALGO / f"{kills.ENV}_1"
+    return folder / "logs" / kills.ALGO / f"{AREA_SEARCH}_1"
 
 
 def change_weights(run):

@@ -132,6 +132,18 @@ def test_rows_of_a_log_are_in_its_file_alone(tmp_path):
     assert not any(isinstance(value, list) and len(value) > 2 for value in vars(resumed).values())
 
 
+def test_rows_of_a_log_that_are_gone_are_named(tmp_path, capsys):
+    log = CsvLog(tmp_path / "log.csv")
+    for i in range(3):
+        log.write({"a": i}, {})
+    state = log.get_state()
+    log.path.write_text("a\n0\n")
+    log.set_state(state)
+    assert capsys.readouterr().out == f"warning: {log.path}: 2 rows of 3 are gone\n"
+    log.write({"a": 3}, {})
+    assert log.path.read_text() == "a\n0\n3\n"
+
+
 # --strict-resume
 
 

@@ -17,6 +17,7 @@ from sb3_roles.prove.promises import Outcome, Setting
 from sb3_roles.prove.remains import first_odd, remains_of_run, remains_of_tables
 from sb3_roles.prove.small_runs import small_settings
 from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ray_options import import_ray
 from sb3_roles.zoo.run_folder import find_run
@@ -24,7 +25,6 @@ from sb3_roles.zoo.run_folder import find_run
 N_PROCESSES, _QUICK_PROCESSES = 5, 2
 _ALGOS, _QUICK_ALGOS = ("hmappo", "gnn", "recurrent_ppo"), ("hmappo",)
 _LOGS, _TABLES, _PLAN = "logs", "out", "plan.yml"
-_ENV = "area-search-v0"
 # One interpreter runs all commands of a trial: starting it takes longer than they do.
 _CODE = """
 import json, sys
@@ -89,7 +89,7 @@ def commands(algos: list[str]) -> None:
     digests: dict[str, str] = {}
     for algo in algos:
         conf = here / f"{algo}.yml"
-        write_yaml(conf, {_ENV: small_settings(algo, 3)})
+        write_yaml(conf, {AREA_SEARCH: small_settings(algo, 3)})
         words = ["--algo", algo, "--conf-file", str(conf), "--seed", "5", "-f", _LOGS]
         words += ["--eval-freq", "40", "--eval-episodes", "4", "--save-freq", "32"]
         words += ["--num-threads", "1", "--device", "cpu", "--verbose", "0"]
@@ -115,7 +115,7 @@ def evaluated(here: Path) -> dict[str, str]:
 
 
 def _run_of(folder: Path, algo: str) -> Path:
-    return find_run(folder / _LOGS, algo, _ENV)
+    return find_run(folder / _LOGS, algo, AREA_SEARCH)
 
 
 def _call(main: Any, *words: str) -> None:

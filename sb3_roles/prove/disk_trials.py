@@ -8,7 +8,6 @@ before stays, as on a full disk, and no rights or file systems are needed.
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import resource
@@ -18,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from sb3_roles.common.checkpoint import CheckpointFolder
+from sb3_roles.prove.processes import run_here
 from sb3_roles.prove.save_loops import stock_model
 from sb3_roles.prove.small_runs import ITERATION
-from sb3_roles.zoo.cli import main as command
 from sb3_roles.zoo.models import load_model
 from sb3_roles.zoo.run_folder import CHECKPOINTS
 
@@ -56,18 +55,13 @@ class FullDisk:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, self._hard))
 
 
-def train(*arguments: str | Path) -> tuple[int, list[str]]:
+def train(*arguments: str | Path) -> tuple[object, list[str]]:
     """Run ``train`` in this process, and return its exit code and what it said on stderr."""
-    error = io.StringIO()
-    with contextlib.redirect_stderr(error), contextlib.redirect_stdout(io.StringIO()):
-        try:
-            code = command([*map(str, arguments), "--verbose", "0"], "train")
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-    return code, error.getvalue().splitlines()
+    ran = run_here([*map(str, arguments), "--verbose", "0"], "train")
+    return ran.code, ran.err.splitlines()
 
 
-def refused(outcome: tuple[int, list[str]], folder: Path) -> str:
+def refused(outcome: tuple[object, list[str]], folder: Path) -> str:
     """Return what is wrong with a command that met a full disk; empty if nothing is."""
     code, lines = outcome
     if code != 2:

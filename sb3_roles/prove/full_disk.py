@@ -11,10 +11,11 @@ from sb3_roles.prove import processes
 from sb3_roles.prove.promises import Outcome, Setting
 from sb3_roles.prove.small_runs import ITERATION, small_settings
 from sb3_roles.zoo.config import write_yaml
+from sb3_roles.zoo.environments import AREA_SEARCH
 
 DISK_TRIALS = "sb3_roles.prove.disk_trials"
 _TIMEOUT = 3600.0
-ALGO, ENV = "hmappo", "area-search-v0"
+ALGO = "hmappo"
 FILES = (
     "lock",
     "args.yml",
@@ -67,7 +68,7 @@ def offsets(setting: Setting) -> Outcome:
 def _begin(folder: Path) -> list[str]:
     """Return the arguments of a run of two iterations that writes each of its files."""
     config = folder / "given.yml"
-    write_yaml(config, {ENV: small_settings(ALGO, 2)})
+    write_yaml(config, {AREA_SEARCH: small_settings(ALGO, 2)})
     words = ["--algo", ALGO, "-conf", str(config), "--seed", "3", "--num-threads", "1"]
     words += ["--save-freq", str(ITERATION), "--eval-freq", str(ITERATION)]
     return [*words, "--eval-episodes", "2", "--device", "cpu"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import resource
@@ -11,13 +10,13 @@ import sys
 import sysconfig
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from sb3_roles.prove.hostile_files import MODULE
-from sb3_roles.zoo.cli import main
+from sb3_roles.prove.processes import run_here
 
 MARGIN = 1 << 30
 """Bytes of address space that a load may take beyond what a sound one has taken."""
@@ -100,23 +99,6 @@ def bound_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
 
 
-def run(words: list[str]) -> tuple[int | str, str]:
-    """Run a command here.
-
-    :param words: name and options
-    :return: exit code, or the exception that came instead, and what it wrote to stderr
-    """
-    errors, code = io.StringIO(), 0  # type: tuple[io.StringIO, int | str]
-    try:
-        with redirect_stderr(errors), redirect_stdout(io.StringIO()):
-            code = main(words)
-    except SystemExit as stop:
-        code = stop.code if isinstance(stop.code, int) else repr(stop.code)
-    except BaseException as error:
-        code = f"{type(error).__name__}: {error}"
-    return code, errors.getvalue()
-
-
 def _too_long(number: int, frame: FrameType | None) -> None:
     raise TimeoutError(f"more than {_SECONDS} s")
 
@@ -142,8 +124,8 @@ def watch_all(
     :param tell: takes what came out
     """
     for words in commands(str(sound), resume_only=False):
-        code, errors = run(words)
-        tell({"folder": sound.name, "command": words[0], "code": code, "errors": errors})
+        ran = run_here(words, caught=(BaseException,))
+        tell({"folder": sound.name, "command": words[0], "code": ran.code, "errors": ran.err})
     watch = Watch(sound.parent)
     bound_memory()
     signal.signal(signal.SIGALRM, _too_long)
@@ -153,14 +135,14 @@ def watch_all(
             start = time.monotonic()
             signal.alarm(_SECONDS)
             with watch.on() as seen:
-                code, errors = run(words)
+                ran = run_here(words, caught=(BaseException,))
             signal.alarm(0)
             tell(
                 {
                     "folder": folder.name,
                     "command": words[0],
-                    "code": code,
-                    "errors": errors,
+                    "code": ran.code,
+                    "errors": ran.err,
                     "seen": list(dict.fromkeys(seen)),
                     "seconds": time.monotonic() - start,
                 }

@@ -18,16 +18,17 @@ from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.prove import processes, watched
 from sb3_roles.prove.promises import Outcome, Setting
 from sb3_roles.prove.small_runs import ITERATION, small_settings
-from sb3_roles.prove.training_runs import checkpoint_difference, log_difference
+from sb3_roles.prove.training_runs import WHOLE, checkpoint_difference, log_difference
 from sb3_roles.prove.watched import BETWEEN, IMPORT, START, Board
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
+from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.models import load_model
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS, SCORES_FILE
+from sb3_roles.zoo.run_folder import CHECKPOINTS, SCORES_FILE
 
 WATCHED = "sb3_roles.prove.watched"
 SAVE_LOOPS = "sb3_roles.prove.save_loops"
-ALGO, ENV = "hmappo", "area-search-v0"
+ALGO = "hmappo"
 _DEADLINE, _TIMEOUT = 300.0, 3600.0
 _ATTEMPTS, _ALLOWED = 3, 10.0
 """Seconds from a signal to the end."""
@@ -55,7 +56,7 @@ class Trainee:
         folder.mkdir(parents=True)
         self.folder, self._options = folder, options
         self._config = folder / "given.yml"
-        write_yaml(self._config, {ENV: settings})
+        write_yaml(self._config, {AREA_SEARCH: settings})
         self.board = Board(folder / "board")
 
     @property
@@ -176,8 +177,7 @@ def run_difference(a: Path | None, b: Path | None) -> str | None:
     newest = [CheckpointFolder(run / CHECKPOINTS).newest()[1] for run in (a, b)]
     found = checkpoint_difference(*newest) or log_difference(a, b)
     if found is None:
-        same = (SCORES_FILE, CONFIG_FILE, f"{BEST}/model.ckpt")
-        return next((n for n in same if (a / n).read_bytes() != (b / n).read_bytes()), None)
+        return next((n for n in WHOLE if (a / n).read_bytes() != (b / n).read_bytes()), None)
     return found
 
 

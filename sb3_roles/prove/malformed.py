@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import subprocess
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_roles.prove.malformed_cases import CASES, Case
-from sb3_roles.prove.processes import environment
+from sb3_roles.prove.processes import environment, run_here
 from sb3_roles.prove.promises import Outcome, Setting
 
 _LIMIT = 1.0
@@ -182,18 +181,12 @@ def in_a_process(case: Case, folder: Path) -> Seen:
 
 def in_this_process(case: Case, folder: Path) -> Seen:
     """Run a case here; what it imports is not seen."""
-    from sb3_roles.zoo.cli import main
-
     first, *words = case.words
     script = first.removesuffix(".py") if first.endswith(".py") else None
-    out, err, start = io.StringIO(), io.StringIO(), time.process_time()
-    code: object
-    with _inside(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            code = main(words if script else [first, *words], script)
-        except SystemExit as end:
-            code = end.code
-    return Seen(code, out.getvalue(), err.getvalue(), time.process_time() - start)
+    start = time.process_time()
+    with _inside(folder):
+        ran = run_here(words if script else case.words, script)
+    return Seen(*ran, time.process_time() - start)
 
 
 @contextlib.contextmanager

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import itertools
 import warnings
 from collections.abc import Callable, Iterator
@@ -20,14 +18,13 @@ import torch as th
 
 from sb3_roles.common import buffers
 from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
-from sb3_roles.common.names import one_line
 from sb3_roles.common.not_finite import NOT_FINITE_FILE
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.mappo import mappo
+from sb3_roles.prove.processes import run_here
 from sb3_roles.prove.promises import Outcome, Setting
 from sb3_roles.prove.small_runs import ITERATION, STEPS, TEAMS, small_settings
 from sb3_roles.zoo import job
-from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.run_folder import CHECKPOINTS
@@ -91,34 +88,29 @@ def trial(algo: str, part: str, value: float, folder: Path, rng: np.random.Gener
         stack.enter_context(_injected(model, part, value, rng))
         return model
 
-    make_model, err = job.make_model, io.StringIO()
+    make_model = job.make_model
     with ExitStack() as stack:
         stack.enter_context(mock.patch.object(job, "make_model", make))
-        stack.enter_context(contextlib.redirect_stderr(err))
-        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            try:
-                code: object = main(list(map(str, words)), "train")
-            except Exception as error:
-                code = f"of a traceback, {type(error).__name__}: {one_line(error)}"
+            code, _, err = run_here(list(map(str, words)), "train", caught=(Exception,))
     if code in (130, 143):
         # The signal was for the experiment.
         raise KeyboardInterrupt
     if not seen:
-        return [f"no training: {err.getvalue()[:200]!r}"]
+        return [f"no training: {err[:200]!r}"]
     model, watch = seen
-    lines = err.getvalue().splitlines()
+    lines = err.splitlines()
     found = [] if code == 3 else [f"exit code {code}"]
     if len(lines) != 1:
-        found.append(f"{len(lines)} lines: {err.getvalue()[:200]!r}")
+        found.append(f"{len(lines)} lines: {err[:200]!r}")
     # The folder's own name has the part in it.
-    said = err.getvalue().replace(str(folder), "")
+    said = err.replace(str(folder), "")
     if not any(name in said for name in _CALLED.get(part, (part,))):
-        found.append(f"not named: {err.getvalue()[:300]!r}")
+        found.append(f"not named: {err[:300]!r}")
     if not _same(watch.last, _state(model)):
         found.append("weights or optimizer changed")
-    return found + _left(folder / "logs" / algo / f"{AREA_SEARCH}_1", err.getvalue())
+    return found + _left(folder / "logs" / algo / f"{AREA_SEARCH}_1", err)
 
 
 def _left(run: Path, said: str) -> list[str]:

@@ -1,13 +1,19 @@
-"""Commands of this package in processes of their own, to be watched, killed and compared."""
+"""Commands of this package, here or in processes of their own, to be watched and compared."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
+
+from sb3_roles.common.names import one_line
 
 _TIMEOUT = 600.0
 
@@ -100,6 +106,44 @@ def finish(
     finally:
         kill_session(process)
     return subprocess.CompletedProcess(process.args, process.returncode, out, error)
+
+
+class Ran(NamedTuple):
+    """What a command of :func:`run_here` left.
+
+    :param code: exit code, or the name and text of an exception that came instead
+    :param out: what it wrote to stdout
+    :param err: what it wrote to stderr
+    """
+
+    code: object
+    out: str
+    err: str
+
+
+def run_here(
+    words: Sequence[str],
+    script: str | None = None,
+    caught: tuple[type[BaseException], ...] = (),
+) -> Ran:
+    """Run a command in this process.
+
+    :param words: see ``zoo.cli.main``
+    :param script: see ``zoo.cli.main``
+    :param caught: exceptions that are an outcome, too; others are passed on
+    """
+    from sb3_roles.zoo.cli import main
+
+    code: object
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(list(words), script)
+        except SystemExit as end:
+            code = end.code
+        except caught as error:
+            code = f"{type(error).__name__}: {one_line(error)}"
+    return Ran(code, out.getvalue(), err.getvalue())
 
 
 def last_line(text: str) -> str:

@@ -16,11 +16,10 @@ import torch as th
 
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointFolder, encode_tree
 from sb3_roles.evaluation.records import TIMINGS, EpisodeRecords, read_records
-from sb3_roles.prove.training_runs import LOGS, untimed_rows, without_times
-from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS
+from sb3_roles.prove.training_runs import LOGS, WHOLE, untimed_rows, without_times
+from sb3_roles.zoo.run_folder import CHECKPOINTS
 
 _DECISION = "decision_us"
-_WHOLE = ("config.yml", "evaluation.yml", f"{BEST}/model.ckpt")
 
 
 def digest(value: Any) -> str:
@@ -69,7 +68,7 @@ def remains_of_run(run: Path) -> dict[str, str]:
     found = remains_of_checkpoint(folder.newest()[1])
     found["names of checkpoints"] = digest([path.name for path in folder.paths()])
     found |= {name: digest(untimed_rows(run / name)) for name in LOGS}
-    whole = {name: run / name for name in _WHOLE}
+    whole = {name: run / name for name in WHOLE}
     return found | {name: digest(one.read_bytes()) for name, one in whole.items() if one.exists()}
 
 

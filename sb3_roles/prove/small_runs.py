@@ -6,6 +6,7 @@ from typing import Any
 
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import resolve
+from sb3_roles.zoo.environments import AREA_SEARCH
 
 SMALL_SCENE = {"height": 9, "width": 9, "n_targets": 8, "n_agents": 3, "horizon": 11}
 TEAMS, STEPS = 4, 8
@@ -41,7 +42,7 @@ _GRAPHS = ("GNNPolicy", "H2GNNPolicy")
 
 
 def small_settings(
-    algo: str, n_iterations: int, env: str = "area-search-v0", **changes: Any
+    algo: str, n_iterations: int, env: str = AREA_SEARCH, **changes: Any
 ) -> dict[str, Any]:
     """Return the keys of a configuration file for a run of seconds.
 
@@ -53,7 +54,7 @@ def small_settings(
     algorithm = ALGORITHMS[algo]
     policy = next(iter(algorithm.policies))
     env_kwargs: dict[str, Any] = {}
-    if env == "area-search-v0":
+    if env == AREA_SEARCH:
         seen = {"known_map": True} if policy in _GRAPHS else {"sub_goal": "nearest"}
         env_kwargs = {**SMALL_SCENE, **seen}
     return {
@@ -74,7 +75,7 @@ def small_run(
     algo: str,
     backend: str = "native",
     n_iterations: int = 3,
-    env: str = "area-search-v0",
+    env: str = AREA_SEARCH,
     seed: int = 3,
     **changes: Any,
 ) -> dict[str, Any]:

@@ -15,15 +15,18 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common.checkpoint import Checkpoint, CheckpointFolder
+from sb3_roles.zoo.config import CONFIG_FILE
 from sb3_roles.zoo.job import run_callbacks, with_state
 from sb3_roles.zoo.models import make_env, make_model
-from sb3_roles.zoo.run_folder import CHECKPOINTS
+from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS, SCORES_FILE
 from sb3_roles.zoo.stop_signals import StopSignals
 from sb3_roles.zoo.training import CsvLog, train
 
 TIMINGS = ("time/fps", "time/time_elapsed")
 """Columns of ``progress.csv`` that differ from one run to the next; no others do."""
 LOGS = ("progress.csv", "roles.csv", "evaluations.csv")
+WHOLE = (CONFIG_FILE, SCORES_FILE, f"{BEST}/model.ckpt")
+"""Files of a finished run that are the same to the last byte."""
 EVALUATED = {"eval_freq": 40, "eval_episodes": 2, "verbose": 0}
 NOT_EVALUATED = {**EVALUATED, "eval_freq": 0}
 

@@ -94,13 +94,15 @@ class CsvLog(KVWriter):
         return {"columns": list(self.columns), "rows": self.n_rows}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Drop what was written after :meth:`get_state`.
+        """Drop what was written after :meth:`get_state`, and say so if rows of before are gone.
 
         :raises CheckpointError: if the file is no log
         """
         self.columns = [str(name) for name in state["columns"]]
         self.n_rows = int(state["rows"])
         rows = self._read()
+        if len(rows) < self.n_rows:
+            print(f"warning: {self.path}: {self.n_rows - len(rows)} rows of {self.n_rows} are gone")
         self._rewrite(rows)
         self.n_rows = len(rows)
 
