@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 
 import numpy as np
 import pytest
@@ -86,8 +87,11 @@ def test_a_callback_that_forgets_its_episodes_is_reported(tmp_path, monkeypatch)
     assert found.startswith("state/")
 
 
-def test_stock_saving_is_compared_with_straight_stock_training(tmp_path):
+def test_stock_saving_is_compared_with_straight_stock_training(monkeypatch, tmp_path):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     said = resumption.stock_cuts(0, tmp_path / "stock", 2, (1,))
+    assert not list((tmp_path / "temporary").glob("SB3-*"))
     assert said.startswith("SB3's PPO after save, load, learn: other weights at 1 of 1 cuts, by up")
     assert "straight" not in said
 

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from sb3_roles.common.checks import check_positive, check_whole
+
 MakeEnv = Callable[[], Any]
 """Makes a new environment at each call: the environment's class, for example."""
 
@@ -17,6 +19,26 @@ PARTS = ("observation", "reward", "termination", "truncation", "info")
 
 class ConformanceError(AssertionError):
     """Something does not do what it should; the message, one line, says where and what."""
+
+
+def check_given(make_env: Any, seed: int, **counts: int) -> None:
+    """Refuse wrong arguments of a check, which would look like faults of the environment.
+
+    :param make_env: makes a new environment
+    :param seed: of play
+    :param counts: name -> number, at least 1
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: naming the first wrong number
+    """
+    if not callable(make_env):
+        name = type(make_env).__name__
+        raise TypeError(
+            "make_env must be a class or function that makes a new environment at each call, got "
+            f"an instance of {name}"
+            + (f": give {name}, or lambda: {name}(...)" if hasattr(make_env, "reset") else "")
+        )
+    check_whole(0, seed=seed)
+    check_positive(**counts)
 
 
 class Moment(NamedTuple):
@@ -55,7 +77,7 @@ class Actions:
     """
 
     def __init__(self, seed: int) -> None:
-        self._seed = seed
+        self._seed = int(seed)
         self._spaces: dict[Any, spaces.Space] = {}
 
     def draw(self, env: Any, last: Moment) -> dict[Any, Any]:
@@ -91,7 +113,7 @@ def reset(env: Any, episode: int = 0, seed: int | None = None) -> Moment:
     :raises ConformanceError: if it fails, or returns something else than two dicts
     """
     where = f"reset of episode {episode}"
-    options = {} if seed is None else {"seed": seed}
+    options = {} if seed is None else {"seed": int(seed)}
     result = _dicts(where, guard(where, env.reset, **options), ("observation", "info"))
     agents = tuple(env.agents)
     return Moment(episode, 0, agents, agents, result[0], {}, {}, {}, result[1])
@@ -215,14 +237,18 @@ def compare(first: Moment, second: Moment, why: str) -> None:
         for agent in (*part, *(agent for agent in other if agent not in part)):
             if (agent in part) != (agent in other):
                 raise ConformanceError(
-                    f"agent {agent!r}, {first.where}: only one of two plays has its {name}; {why}"
+                    f"agent {agent!r}, {first.where}: only one of two plays has its {name}, "
+                    f"expected both or neither: {why}"
                 )
             text = difference(part[agent], other[agent], name)
             if text:
-                raise ConformanceError(f"agent {agent!r}, {first.where}: {text}; {why}")
+                raise ConformanceError(
+                    f"agent {agent!r}, {first.where}: {text}, expected to be equal: {why}"
+                )
     if first.after != second.after:
         raise ConformanceError(
-            f"{first.where}: env.agents is {list(first.after)} and {list(second.after)}; {why}"
+            f"{first.where}: env.agents is {list(first.after)} and {list(second.after)}, expected "
+            f"to be equal: {why}"
         )
 
 
