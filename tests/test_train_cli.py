@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import toy_envs
 import yaml
 
 from sb3_roles.common.checkpoint import CheckpointFolder
@@ -458,6 +460,48 @@ def test_numbers_that_are_not_finite(tmp_path, monkeypatch, capsys, error):
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert message.endswith("the loss is nan: no step was taken\n")
+
+
+@pytest.mark.parametrize("error", [SystemExit(0), OSError("bad memory"), KeyError("x")])
+@pytest.mark.parametrize("when", ["training", "evaluation"])
+def test_an_error_of_an_environment_is_one_line_and_one_exit_code(
+    tmp_path, monkeypatch, capsys, error, when
+):
+    def step(env, actions):
+        raise error
+
+    if when == "training":
+        monkeypatch.setattr(toy_envs.PlainEnv, "step", step)
+    else:
+        own = job._evaluate
+
+        def evaluate(*args):
+            monkeypatch.setattr(toy_envs.PlainEnv, "step", step)
+            own(*args)
+
+        monkeypatch.setattr(job, "_evaluate", evaluate)
+    env = ["--env", "toy_envs:PlainEnv", "--algo", "mappo", "-f", str(tmp_path), "-n", "32"]
+    assert main([*env, *SMALL, *FAST], "train") == 3
+    message = capsys.readouterr().err
+    run = tmp_path / "mappo" / "toy_envs-PlainEnv_1"
+    name = type(error).__name__
+    begin = f"train.py: error: {run}: environment toy_envs:PlainEnv: {name} in step 1: {error} ("
+    assert message.startswith(begin)
+    assert message.count("\n") == 1
+
+
+def test_the_command_that_goes_on_names_the_environment(tmp_path, monkeypatch, capsys):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    env = ["--env", "toy_envs:PlainEnv"]
+    words = [*env, "--algo", "mappo", "-f", str(tmp_path / "my logs"), "-n", "32"]
+    with monkeypatch.context() as patch:
+        patch.setattr(job, "_evaluate", interrupted)
+        assert main([*words, *SMALL, *FAST], "train") == 130
+    last = capsys.readouterr().out.splitlines()[-1]
+    command = shlex.split(last.removeprefix("stopped; to go on: "))
+    assert main(command[1:], command[0].removesuffix(".py")) == 0
 
 
 def test_a_foreign_environment(tmp_path):

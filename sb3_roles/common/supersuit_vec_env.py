@@ -1,7 +1,8 @@
 """Any PettingZoo environment through SuperSuit, with what SuperSuit breaks repaired."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,15 @@ from sb3_roles.common.env_declarations import (
     declared,
     declared_names,
 )
+from sb3_roles.common.env_failures import (
+    RESET_PARTS,
+    STEP_PARTS,
+    EnvironmentFailed,
+    called,
+    env_class,
+    failure,
+    parts_problem,
+)
 
 Observations = dict[str, np.ndarray] | np.ndarray
 
@@ -30,7 +40,8 @@ class TeamRecorder(ParallelEnv):
     * Infos of a reset are kept aside: SuperSuit merges them over those of the terminal step.
     * Observations and infos of the terminal step are copied: an environment that reuses its arrays
       would overwrite them in that reset.
-    * Agents that are done before the others give a clear error.
+    * Agents that are done before the others give a clear error, and so does what the environment
+      raises; its steps are counted from the reset.
     * SuperSuit copies by pickling. That fails for windows, files and locks, and silently takes
       numpy views apart from the arrays they show (refused). Where there is a function that makes
       the environment, a copy is made by calling it instead.
@@ -55,6 +66,7 @@ class TeamRecorder(ParallelEnv):
             (len(self.possible_agents), len(self.component_names)), np.float32
         )
         self.metric_values = np.zeros(len(self.metric_names))
+        self._n_steps = 0
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         return (_record, (self.make,)) if self.make else super().__reduce_ex__(protocol)
@@ -71,7 +83,10 @@ class TeamRecorder(ParallelEnv):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Reset the environment; its infos go to ``reset_infos``, the returned ones are empty."""
-        observations, infos = self.env.reset(seed=seed, options=options)
+        self._n_steps = 0
+        observations, infos = self._called(
+            "reset", RESET_PARTS, self.env.reset, seed=seed, options=options
+        )
         self._check_alive(observations, "after reset()")
         self.reset_infos = [copy.deepcopy(infos.get(agent, {})) for agent in self.possible_agents]
         return observations, {}
@@ -86,7 +101,10 @@ class TeamRecorder(ParallelEnv):
         dict[str, dict[str, Any]],
     ]:
         """Step the environment and record components and metrics (see the class)."""
-        observations, rewards, terminations, truncations, foreign = self.env.step(actions)
+        self._n_steps += 1
+        observations, rewards, terminations, truncations, foreign = self._called(
+            f"step {self._n_steps}", STEP_PARTS, self.env.step, actions
+        )
         self._check_alive(observations, "after step()")
         infos: dict[str, dict[str, Any]] = {}
         for row, agent in enumerate(self.possible_agents):
@@ -114,6 +132,20 @@ class TeamRecorder(ParallelEnv):
                 )
             observations = copy.deepcopy(observations)
         return observations, rewards, terminations, truncations, infos
+
+    def _called(
+        self,
+        where: str,
+        names: tuple[str, ...],
+        function: Callable[..., Any],
+        *args: Any,
+        **kw: Any,
+    ) -> Any:
+        result = called(self.env, where, function, *args, **kw)
+        problem = parts_problem(result, names)
+        if problem is not None:
+            raise EnvironmentFailed(f"environment {env_class(self.env)}: {where}: {problem}")
+        return result
 
     def _check_alive(self, observations: Mapping[str, object], when: str) -> None:
         missing = [agent for agent in self.possible_agents if agent not in observations]
@@ -217,14 +249,23 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
 
     def _reset_all(self, seeds: list[int] | None, options: list[dict[str, Any]]) -> Observations:
         # One by one: SuperSuit's own reset would seed copy i with seed + i.
-        parts = [
-            copied.reset(seed=None if seeds is None else seeds[team], options=options[team] or None)
-            for team, copied in enumerate(self._vec.vec_envs)
-        ]
-        observations = self._vec.concat_obs([part[0] for part in parts])
+        with self._telling():
+            parts = [
+                copied.reset(seed=seeds and seeds[team], options=options[team] or None)
+                for team, copied in enumerate(self._vec.vec_envs)
+            ]
+            observations = self._vec.concat_obs([part[0] for part in parts])
         self.reset_infos = [info for recorder in self._recorders for info in recorder.reset_infos]
         self._check_team_keys(observations)
         return self._collapse(observations)
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Tell what SuperSuit fails on, such as an info that is None, as the environment's."""
+        try:
+            yield
+        except (TypeError, LookupError, AttributeError) as error:
+            raise failure(self._recorders[0].env, "what it returned", error) from error
 
     def _check_team_keys(self, observations: Observations) -> None:
         """Refuse a wrong declaration; at resets only, because it reads every map."""
@@ -254,8 +295,10 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
         :raises NotFiniteError: if a reward or an observation is not finite
         :raises ValueError: if agents do not finish together, or a declared reward component or
             metric is missing
+        :raises EnvironmentFailed: if the environment raises, or returns something else than dicts
         """
-        observations, rewards, terminated, truncated, infos = self._vec.step(self._actions)
+        with self._telling():
+            observations, rewards, terminated, truncated, infos = self._vec.step(self._actions)
         if self.component_names:
             self.reward_components = np.concatenate([r.component_values for r in self._recorders])
         self._check_rewards(rewards)

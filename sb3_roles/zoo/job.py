@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -21,6 +23,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
+from sb3_roles.common.env_failures import EnvironmentFailed
 from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
@@ -36,7 +39,7 @@ from sb3_roles.evaluation.evaluators import (
 )
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
-from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scenes_of_run
+from sb3_roles.zoo.environments import AREA_SEARCH, ENVIRONMENTS, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
 from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model
 from sb3_roles.zoo.options import UsageError
@@ -104,12 +107,22 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
                 stop.check()
                 return _train_in(run, model, job, stop)
             except KeyboardInterrupt:
-                print(f"stopped; to go on: train.py --resume {run}", flush=True)
+                print(f"stopped; to go on: {_resuming(run, config)}", flush=True)
                 return stop.exit_code
+            except EnvironmentFailed as error:
+                if options["verbose"] > 1:
+                    traceback.print_exception(error)
+                raise TrainingFailed(f"{run}: {error}") from error
             finally:
                 lock.release()
     finally:
         env.close()
+
+
+def _resuming(run: Path, config: Mapping[str, Any]) -> str:
+    """Return the command that goes on with a run; code that it is to call has to be named."""
+    own = [] if config["env"] in ENVIRONMENTS else ["--env", config["env"]]
+    return shlex.join(["train.py", "--resume", str(run), *own])
 
 
 def _ask(config: Mapping[str, Any], question: Callable[[], object]) -> None:
@@ -213,7 +226,7 @@ def _train_in(
             )
         except CheckpointError as error:
             raise UsageError(f"{run}: {error}") from error
-        except UsageError:
+        except (UsageError, EnvironmentFailed):
             raise
         except NotFiniteError as error:
             message = f"{run}: {_kept(run, model, error)}"

@@ -141,8 +141,8 @@ def run(args: argparse.Namespace) -> int:
     """Train, once for each algorithm, change and seed.
 
     :param args: parsed arguments
-    :return: 0; 2 if the configuration is wrong; 3 if a loss or reward is not finite; 130 or 143
-        after a signal
+    :return: 0; 2 if the configuration is wrong; 3 if a loss or reward is not finite, or the
+        environment fails; 130 or 143 after a signal
     :raises UsageError: if the arguments do not go together
     """
     stop = StopSignals()
