@@ -66,6 +66,8 @@ WRONG = [
     (["--device", "gpu"], "allowed are auto, cpu, cuda"),
     (["--num-threads", "0"], "from 1 to 1024"),
     (["--resume", "/no/such/run"], "no such run folder"),
+    (["--resume", ""], "argument --resume: must name a folder, got ''"),
+    (["-f", ""], "argument -f/--log-folder: must name a folder, got ''"),
     (["--resume", "x", "--seed", "3"], "leave --seed out"),
     (["--seed", str(2**32)], "from 0 to 4294967295"),
     (["--seed", str(2**32 - 1), "--n-seeds", "2"], "seed must be"),
@@ -518,3 +520,43 @@ def test_a_foreign_environment(tmp_path):
     assert result.returncode == 0, result.stderr
     assert "not bit-exact: environment of this run offers no get_state" in result.stdout
     assert yaml.safe_load((run / "config.yml").read_text())["n_timesteps"] == 96
+
+
+def test_what_is_no_run_folder_names_the_runs_there(tmp_path, capsys):
+    for name in ("mappo/small_1", "mappo/small_2", "ppo/small_1"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "config.yml").write_text("x")
+    folder = tmp_path / "mappo"
+    code, _, err = run_main(capsys, "--resume", str(folder))
+    what = f"{folder}: no run folder, without config.yml; runs in {folder}: small_1, small_2\n"
+    assert (code, err) == (2, f"train.py: error: {what}")
+    _, _, err = run_main(capsys, "--resume", str(tmp_path / "nope"))
+    assert err.endswith(f"runs in {tmp_path}: mappo/small_1, mappo/small_2, ppo/small_1\n")
+    _, _, err = run_main(capsys, "--resume", str(folder / "smal_2"))
+    assert err.endswith(f"did you mean {str(folder / 'small_2')!r}?\n")
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "best"])
+def test_a_run_that_can_not_be_written_is_refused_before_anything_changes(logs, tmp_path, name):
+    run = tmp_path / "run"
+    shutil.copytree(logs[0] / "mappo" / "area-search-v0_1", run)
+    if name == "best":
+        (run / name).write_text("")
+    else:
+        (run / name).rename(tmp_path / "aside")
+        (run / name).write_text("")
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    with pytest.raises(SystemExit):
+        main(["--resume", str(run), "-n", "640"], "train")
+    assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+
+
+def test_what_keeps_a_checkpoint_from_fitting_is_named(logs, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(logs[0] / "mappo" / "area-search-v0_1", run)
+    config = yaml.safe_load((run / "config.yml").read_text())
+    write_yaml(run / "config.yml", {**config, "n_envs": 2})
+    code, _, err = run_main(capsys, "--resume", str(run), "-n", "640")
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "n_envs was 4, is 2" in err

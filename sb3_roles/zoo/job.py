@@ -41,10 +41,11 @@ from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
 from sb3_roles.zoo.environments import AREA_SEARCH, ENVIRONMENTS, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
-from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model
+from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model, told
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ray_options import rollouts_on_ray
-from sb3_roles.zoo.resumption import has_checkpoint, note_inexact, read_newest
+from sb3_roles.zoo.resumption import has_checkpoint, note_anew, note_inexact, read_newest
+from sb3_roles.zoo.run_facts import PROGRESS
 from sb3_roles.zoo.run_folder import (
     BEST,
     CHECKPOINTS,
@@ -95,8 +96,10 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
-        if options.get("strict_resume") and goes_on:
-            # Before anything in the folder is touched, even its lock.
+        # Before anything in the folder is touched, even its lock.
+        if options.get("strict_resume") and not goes_on:
+            note_anew(job)
+        elif options.get("strict_resume"):
             folder = CheckpointFolder(Path(job["resume"]) / CHECKPOINTS)
             note_inexact(read_newest(folder, model, complete(config))[2], job)
         # Ray has a handler of its own.
@@ -184,17 +187,19 @@ def _train_in(
     for folder in (run, run / BEST):
         remove_partial(folder)
     resume, begun = None, 0
+    reasons: list[str] = []
     if job["resume"] is not None and not has_checkpoint(run):
-        print(f"{run} has no checkpoint yet: it begins anew", flush=True)
+        note_anew(job)
     elif job["resume"] is not None:
-        resume, begun, reasons = read_newest(checkpoints, model, config)
+        again = bool(options.get("strict_resume"))
+        resume, begun, reasons = read_newest(checkpoints, model, config, again)
         note_inexact(reasons, job)
         if options.get("n_timesteps", begun) < begun:
             wanted = options["n_timesteps"]
             raise UsageError(f"{run} has {begun} joint steps already, more than -n {wanted}")
 
     with ExitStack() as stack:
-        log = CsvLog(run / "progress.csv")
+        log = CsvLog(run / PROGRESS)
         logger = _logger(run, log, config, options)
         stack.callback(logger.close)
         model.set_logger(logger)
@@ -225,7 +230,8 @@ def _train_in(
                 begin=begin,
             )
         except CheckpointError as error:
-            raise UsageError(f"{run}: {error}") from error
+            since = f" (since then: {'; '.join(reasons)})" if reasons else ""
+            raise UsageError(told(run, error) + since) from error
         except (UsageError, EnvironmentFailed):
             raise
         except NotFiniteError as error:
@@ -248,6 +254,8 @@ def _train_in(
             raise MemoryError(one_line(error)) from error
     print(f"{run}: {steps} joint steps; checkpoints: {len(checkpoints.paths())}", flush=True)
     stop.check()
+    if options["verbose"]:
+        print(f"evaluating {options['eval_episodes']} held-out episodes", flush=True)
     _evaluate(run, model, config, options["eval_episodes"])
     # Of a signal that came while the scores were written: no other run shall begin.
     stop.check()
