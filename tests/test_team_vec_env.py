@@ -573,7 +573,7 @@ def leave(env):
         (lambda env: ({}, {}, {}, {}, None), r"step 3: expected 5 dicts .*, got NoneType as info"),
         (
             lambda env: (env.observe(), {}, {}, {}, {"a": None}),
-            "TypeError in what it returned: 'NoneType' object is not iterable",
+            "what it returned can not be put together: TypeError: .* is not iterable",
         ),
     ],
 )

@@ -15,7 +15,8 @@ STEP_PARTS = ("observation", "reward", "termination", "truncation", "info")
 _LIBRARIES = tuple(sorted({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")}))
 
 
-class EnvironmentFailed(RuntimeError):
+# A ValueError, as all that says what is wrong with an environment.
+class EnvironmentFailed(ValueError):
     """An environment raised an error, or broke its interface; the message is one line."""
 
 
@@ -25,7 +26,7 @@ def env_class(env: object) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
-def failure(env: object, where: str, error: BaseException) -> EnvironmentFailed:
+def _failure(env: object, where: str, error: BaseException) -> EnvironmentFailed:
     """Make the error that tells another one as the environment's.
 
     :param env: the environment
@@ -53,11 +54,11 @@ def called(env: object, where: str, function: Callable[..., Any], *args: Any, **
     except (EnvironmentFailed, MemoryError):
         raise
     except Exception as error:
-        raise failure(env, where, error) from error
+        raise _failure(env, where, error) from error
     except SystemExit as error:
         if type(error) is not SystemExit:
             raise  # The program's own, see ``zoo.stop_signals``.
-        raise failure(env, where, error) from error
+        raise _failure(env, where, error) from error
 
 
 def place_of(error: BaseException, env: object = None) -> str:

@@ -24,9 +24,9 @@ from sb3_roles.common.env_failures import (
     EnvironmentFailed,
     called,
     env_class,
-    failure,
     parts_problem,
 )
+from sb3_roles.common.names import one_line
 
 Observations = dict[str, np.ndarray] | np.ndarray
 
@@ -87,7 +87,7 @@ class TeamRecorder(ParallelEnv):
         observations, infos = self._called(
             "reset", RESET_PARTS, self.env.reset, seed=seed, options=options
         )
-        self._check_alive(observations, "after reset()")
+        self._check_alive(observations)
         self.reset_infos = [copy.deepcopy(infos.get(agent, {})) for agent in self.possible_agents]
         return observations, {}
 
@@ -105,16 +105,16 @@ class TeamRecorder(ParallelEnv):
         observations, rewards, terminations, truncations, foreign = self._called(
             f"step {self._n_steps}", STEP_PARTS, self.env.step, actions
         )
-        self._check_alive(observations, "after step()")
+        self._check_alive(observations)
         infos: dict[str, dict[str, Any]] = {}
         for row, agent in enumerate(self.possible_agents):
             info = dict(foreign.get(agent, {}))
             if self.component_names:
-                self.component_values[row] = _take(
+                self.component_values[row] = self._take(
                     info, agent, "reward_components", self.component_names
                 )
             if self.metric_names:
-                values = _take(info, agent, "metrics", self.metric_names)
+                values = self._take(info, agent, "metrics", self.metric_names)
                 if row == 0:
                     self.metric_values[:] = values
             infos[agent] = copy.deepcopy(info) if info else info
@@ -126,7 +126,7 @@ class TeamRecorder(ParallelEnv):
         if over:
             running = [agent for agent in self.possible_agents if agent not in over]
             if running:
-                raise ValueError(
+                raise self._refused(
                     f"agents {over} are done while {running} are not: the agents of a team must "
                     "finish together. Keep them alive and idle to the end of the episode"
                 )
@@ -144,16 +144,45 @@ class TeamRecorder(ParallelEnv):
         result = called(self.env, where, function, *args, **kw)
         problem = parts_problem(result, names)
         if problem is not None:
-            raise EnvironmentFailed(f"environment {env_class(self.env)}: {where}: {problem}")
+            raise self._refused(problem)
         return result
 
-    def _check_alive(self, observations: Mapping[str, object], when: str) -> None:
+    def _check_alive(self, observations: Mapping[str, object]) -> None:
         missing = [agent for agent in self.possible_agents if agent not in observations]
         if missing:
-            raise ValueError(
-                f"no observation for agents {missing} {when}: all of {self.possible_agents} must "
+            raise self._refused(
+                f"no observation for agents {missing}: all of {self.possible_agents} must "
                 "be there from reset() to the end of the episode"
             )
+
+    def _take(
+        self, info: dict[str, Any], agent: str, key: str, names: tuple[str, ...]
+    ) -> list[float]:
+        """
+        Take the declared values of one kind out of an agent's info.
+
+        :param info: changed in place
+        :param agent: name of the agent, for the error
+        :param key: ``"reward_components"`` or ``"metrics"``
+        :param names: names that the environment declares
+        :raises EnvironmentFailed: if the key or one of the names is not there
+        """
+        values = info.pop(key, None)
+        if values is None:
+            raise self._refused(
+                f"infos[{agent!r}] has no {key!r}, although the environment declares {names}: put "
+                "a dict of floats there at every step, or do not declare them"
+            )
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise self._refused(
+                f"infos[{agent!r}][{key!r}] has {list(values)}, but not the declared {missing}"
+            )
+        return [values[name] for name in names]
+
+    def _refused(self, text: str) -> EnvironmentFailed:
+        where = f"step {self._n_steps}" if self._n_steps else "reset"
+        return EnvironmentFailed(f"environment {env_class(self.env)}: {where}: {text}")
 
     def render(self) -> Any:
         """Render the environment."""
@@ -166,30 +195,6 @@ class TeamRecorder(ParallelEnv):
 
 def _record(make: Callable[[], ParallelEnv]) -> TeamRecorder:
     return TeamRecorder(make(), make)
-
-
-def _take(info: dict[str, Any], agent: str, key: str, names: tuple[str, ...]) -> list[float]:
-    """
-    Take the declared values of one kind out of an agent's info.
-
-    :param info: changed in place
-    :param agent: name of the agent, for the error
-    :param key: ``"reward_components"`` or ``"metrics"``
-    :param names: names that the environment declares
-    :raises ValueError: if the key or one of the names is not there
-    """
-    values = info.pop(key, None)
-    if values is None:
-        raise ValueError(
-            f"infos[{agent!r}] has no {key!r}, although the environment declares {names}: put a "
-            "dict of floats there at every step, or do not declare them"
-        )
-    missing = [name for name in names if name not in values]
-    if missing:
-        raise ValueError(
-            f"infos[{agent!r}][{key!r}] has {list(values)}, but not the declared {missing}"
-        )
-    return [values[name] for name in names]
 
 
 class SuperSuitTeamVecEnv(TeamVecEnv):
@@ -261,11 +266,16 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
 
     @contextmanager
     def _telling(self) -> Iterator[None]:
-        """Tell what SuperSuit fails on, such as an info that is None, as the environment's."""
+        """Tell what SuperSuit fails on, such as an observation of another shape."""
         try:
             yield
-        except (TypeError, LookupError, AttributeError) as error:
-            raise failure(self._recorders[0].env, "what it returned", error) from error
+        except EnvironmentFailed:
+            raise
+        except (TypeError, LookupError, AttributeError, ValueError) as error:
+            raise EnvironmentFailed(
+                f"environment {env_class(self._recorders[0].env)}: what it returned can not be put "
+                f"together: {type(error).__name__}: {one_line(error)}"
+            ) from error
 
     def _check_team_keys(self, observations: Observations) -> None:
         """Refuse a wrong declaration; at resets only, because it reads every map."""
@@ -293,9 +303,8 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
 
         :return: observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos
         :raises NotFiniteError: if a reward or an observation is not finite
-        :raises ValueError: if agents do not finish together, or a declared reward component or
-            metric is missing
-        :raises EnvironmentFailed: if the environment raises, or returns something else than dicts
+        :raises EnvironmentFailed: if the environment raises or returns something else than dicts,
+            agents do not finish together, or a declared reward component or metric is missing
         """
         with self._telling():
             observations, rewards, terminated, truncated, infos = self._vec.step(self._actions)

@@ -192,7 +192,7 @@ class VecEnvEvaluator:
             if length.max() > MAX_EPISODE_STEPS:
                 raise EnvironmentFailed(
                     f"{env_name(self.env)}: an episode of the evaluation has not ended within "
-                    f"{MAX_EPISODE_STEPS:,} steps; sb3_roles.testing.check_episode_ends looks for the reason"
+                    f"{MAX_EPISODE_STEPS:,} steps; sb3_roles.testing.check_episode_ends tells when"
                 )
             for team in np.flatnonzero(starts[::agents]):
                 if left[team] > 0:
