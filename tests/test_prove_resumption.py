@@ -228,6 +228,20 @@ def test_strict_resume_goes_on_where_nothing_differs(run, capsys):
     assert CheckpointFolder(run / "checkpoints").newest()[1].manifest["env_steps"] == steps
 
 
+def test_that_the_newest_checkpoint_is_damaged_is_said_once(run, capsys):
+    folder = CheckpointFolder(run / "checkpoints")
+    newest, sound = folder.paths()[-1], folder.paths()[-1].read_bytes()
+    try:
+        newest.write_bytes(sound[:100])
+        newest.with_name("step_000000000001.ckpt").write_bytes(sound)
+        code, said = strict(capsys, run)
+    finally:
+        newest.write_bytes(sound)
+        newest.with_name("step_000000000001.ckpt").unlink(missing_ok=True)
+    assert code == 0
+    assert said.out.count("going back to step_000000000001.ckpt") == 1
+
+
 def test_without_it_the_differences_are_printed(run, capsys):
     code = main(["--resume", str(run), "-n", "96", "--verbose", "0"], "train")
     assert code == 0

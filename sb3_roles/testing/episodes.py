@@ -10,11 +10,11 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_roles.common.checks import check_positive, check_whole
+from sb3_roles.common.env_failures import RESET_PARTS, STEP_PARTS, parts_problem, place_of
+from sb3_roles.common.names import one_line
 
 MakeEnv = Callable[[], Any]
 """Makes a new environment at each call: the environment's class, for example."""
-
-PARTS = ("observation", "reward", "termination", "truncation", "info")
 
 
 class ConformanceError(AssertionError):
@@ -64,7 +64,7 @@ class Moment(NamedTuple):
 
     def parts(self) -> dict[str, dict[Any, Any]]:
         """Return the dicts by name; of a reset only those that it returns."""
-        names = PARTS if self.step else ("observation", "info")
+        names = STEP_PARTS if self.step else RESET_PARTS
         return {name: getattr(self, name) for name in names}
 
 
@@ -114,7 +114,7 @@ def reset(env: Any, episode: int = 0, seed: int | None = None) -> Moment:
     """
     where = f"reset of episode {episode}"
     options = {} if seed is None else {"seed": int(seed)}
-    result = _dicts(where, guard(where, env.reset, **options), ("observation", "info"))
+    result = _dicts(where, guard(where, env.reset, **options), RESET_PARTS)
     agents = tuple(env.agents)
     return Moment(episode, 0, agents, agents, result[0], {}, {}, {}, result[1])
 
@@ -129,7 +129,7 @@ def step(env: Any, last: Moment, actions: dict[Any, Any]) -> Moment:
     """
     before, number = tuple(env.agents), last.step + 1
     where = f"step {number} of episode {last.episode}"
-    result = _dicts(where, guard(where, env.step, actions), PARTS)
+    result = _dicts(where, guard(where, env.step, actions), STEP_PARTS)
     return Moment(last.episode, number, before, tuple(env.agents), *result)
 
 
@@ -174,20 +174,14 @@ def guard(where: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -
     try:
         return function(*args, **kwargs)
     except Exception as error:
-        said = " ".join(str(error).split())
+        said = f"{one_line(error)}{place_of(error)}"
         raise ConformanceError(f"{where}: it raised {type(error).__name__}: {said}") from error
 
 
 def _dicts(where: str, result: Any, names: tuple[str, ...]) -> list[dict[Any, Any]]:
-    expected = f"{len(names)} dicts by agent ({', '.join(names)})"
-    if not isinstance(result, tuple) or len(result) != len(names):
-        got = f"{len(result)} values" if isinstance(result, tuple) else type(result).__name__
-        raise ConformanceError(f"{where}: expected {expected}, got {got}")
-    for name, part in zip(names, result, strict=True):
-        if not isinstance(part, dict):
-            raise ConformanceError(
-                f"{where}: expected {expected}, got {type(part).__name__} as {name}"
-            )
+    problem = parts_problem(result, names)
+    if problem is not None:
+        raise ConformanceError(f"{where}: {problem}")
     return list(result)
 
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_roles.testing.episodes import PARTS, MakeEnv, Moment, play
+from sb3_roles.common.env_failures import STEP_PARTS
+from sb3_roles.testing.episodes import MakeEnv, Moment, play
 
 _LARGE = 256
 """Bytes above which an array is not kept."""
@@ -40,7 +41,7 @@ def noted(moment: Moment) -> Moment:
 
     :param moment: to copy
     """
-    return moment._replace(**{name: _small(getattr(moment, name)) for name in PARTS})
+    return moment._replace(**{name: _small(getattr(moment, name)) for name in STEP_PARTS})
 
 
 def noted_play(make_env: MakeEnv, n_steps: int, seed: int) -> list[Moment]:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from sb3_roles._version import __version__
+from sb3_roles.common.env_failures import EnvironmentFailed
 from sb3_roles.zoo.options import Parser, UsageError
 
 COMMANDS = (
@@ -30,7 +31,7 @@ COMMANDS = (
     "sb3_roles.zoo.bench",
     "sb3_roles.prove.command",
 )
-EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
+EXIT_FAILED, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 3, 130, 141
 
 
 def make_parser(script: str | None = None) -> Parser:
@@ -56,8 +57,8 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
 
     :param argv: arguments without the name of the program, ``sys.argv[1:]`` by default
     :param script: the command, where it is not the first argument: ``"train"`` for ``train.py``
-    :return: the exit code: 0, 2 after a usage error, 130 after Ctrl-C, 141 after a closed pipe, or
-        the command's own
+    :return: the exit code: 0, 2 after a usage error, 3 after an error of an environment, 130 after
+        Ctrl-C, 141 after a closed pipe, or the command's own
     :raises SystemExit: after help, ``--version`` and a wrong command line
     """
     if hasattr(sys.stdout, "reconfigure"):
@@ -84,6 +85,9 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
         return EXIT_CLOSED_PIPE
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    except EnvironmentFailed as error:
+        print(f"{parser.prog}: error: {error}", file=sys.stderr)
+        return EXIT_FAILED
     except UsageError as error:
         parser.error(str(error))
     except MemoryError as error:

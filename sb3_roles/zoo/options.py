@@ -166,6 +166,13 @@ def output_file(*endings: str) -> Callable[[str], Path]:
     return path
 
 
+def folder_name(text: str) -> str:
+    """Read the name of a folder: no name is not the current one."""
+    if not text:
+        raise argparse.ArgumentTypeError("must name a folder, got ''")
+    return text
+
+
 def check_folder(option: str, folder: Path) -> None:
     """Find out, before work that takes long, whether a folder can be made, or written to.
 

@@ -18,6 +18,10 @@ _STDERR = 2
 _SAME_STOP = 0.3
 
 
+class SecondSignal(SystemExit):
+    """The end of the program: no exit that an environment of anybody's own has asked for."""
+
+
 class StopSignals:
     """Whether, and how, the user asked to stop.
 
@@ -91,7 +95,7 @@ class StopSignals:
         if self.received is not None:
             if now - self._when < _SAME_STOP:
                 return
-            raise SystemExit(128 + number)
+            raise SecondSignal(128 + number)
         self.received, self._when = number, now
         message = self._at_once or self.message
         if message:
