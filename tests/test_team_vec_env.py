@@ -591,6 +591,21 @@ def test_an_error_of_an_environment_is_told_as_such(monkeypatch, fail, message):
     assert "\n" not in str(seen.value)
 
 
+@pytest.mark.parametrize("name", ["observation_space", "action_space", "render", "close"])
+def test_so_is_one_outside_of_its_steps(monkeypatch, name):
+    def fail(env, agent=None):
+        raise RuntimeError("no window")
+
+    monkeypatch.setattr(PlainEnv, "render_mode", "rgb_array", raising=False)
+    vec_env = make_team_vec_env(PlainEnv, 1, 0)
+    vec_env.reset()
+    monkeypatch.setattr(PlainEnv, name, fail)
+    use = {"render": vec_env.render, "close": vec_env.close}
+    message = rf"toy_envs:PlainEnv: RuntimeError in {name}: no window \(test_team_vec_env.py:\d+\)"
+    with pytest.raises(EnvironmentFailed, match=message):
+        use.get(name, lambda: make_team_vec_env(PlainEnv, 1, 0))()
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SecondSignal(143), MemoryError])
 def test_stops_and_a_lack_of_memory_pass_through_an_environment(monkeypatch, error):
     def fail(env, actions):

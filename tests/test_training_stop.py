@@ -141,7 +141,7 @@ def test_a_signal_while_a_file_is_replaced_waits_for_it(tmp_path, monkeypatch):
 
 def test_the_second_signal_ends_at_once(monkeypatch):
     stop = StopSignals()
-    monkeypatch.setattr(stop_signals, "_SAME_STOP", 0.0)
+    monkeypatch.setattr(stop_signals, "SAME_STOP", 0.0)
     with pytest.raises(SystemExit) as end, stop.caught(), stop.held():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)

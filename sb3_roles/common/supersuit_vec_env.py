@@ -186,11 +186,11 @@ class TeamRecorder(ParallelEnv):
 
     def render(self) -> Any:
         """Render the environment."""
-        return self.env.render()
+        return called(self.env, "render", self.env.render)
 
     def close(self) -> None:
         """Close the environment."""
-        self.env.close()
+        called(self.env, "close", self.env.close)
 
 
 def _record(make: Callable[[], ParallelEnv]) -> TeamRecorder:

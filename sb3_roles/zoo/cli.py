@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
 from sb3_roles._version import __version__
 from sb3_roles.common.env_failures import EnvironmentFailed
+from sb3_roles.common.interrupts import interrupt_once
 from sb3_roles.zoo.options import Parser, UsageError
 
 COMMANDS = (
@@ -61,6 +63,17 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
         Ctrl-C, 141 after a closed pipe, or the command's own
     :raises SystemExit: after help, ``--version`` and a wrong command line
     """
+    if argv is not None:
+        return _main(argv, script)
+    interrupt_once()
+    try:
+        return _main(sys.argv[1:], script)
+    finally:
+        # The process ends; a Ctrl-C now would have the interpreter print a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _main(arguments: Sequence[str], script: str | None) -> int:
     if hasattr(sys.stdout, "reconfigure"):
         # A terminal that can not show "±" gets "?", not a traceback.
         sys.stdout.reconfigure(errors="replace")
@@ -68,10 +81,9 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
         parser = make_parser(script)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = [*arguments] if script is None else [script, *arguments]
     try:
         try:
-            arguments = arguments if script is None else [script, *arguments]
             args = parser.parse_args(arguments)
             args.arguments, parser = arguments, args.parser
             code = args.run(args)

@@ -10,12 +10,10 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 
 from sb3_roles.common.files import is_writing
+from sb3_roles.common.interrupts import SAME_STOP
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STDERR = 2
-# Seconds within which a second signal is the first one's: timeout, srun and some terminals signal a
-# process and its group.
-_SAME_STOP = 0.3
 
 
 class SecondSignal(SystemExit):
@@ -93,7 +91,7 @@ class StopSignals:
     def _note(self, number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
         if self.received is not None:
-            if now - self._when < _SAME_STOP:
+            if now - self._when < SAME_STOP:
                 return
             raise SecondSignal(128 + number)
         self.received, self._when = number, now
