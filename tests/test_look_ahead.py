@@ -110,7 +110,7 @@ def test_unseen_cells_are_worth_the_targets_to_be_expected():
     density = batch.scene.n_targets / batch.scene.n_free
     check(got, [RIGHT], 2)
     # Worths are rounded to 1 / 1024 of a target.
-    expected = unseen_worths(density, batch.scene.horizon)[2] * late(2, 3)
+    expected = unseen_worths(density, 1, batch.scene.horizon)[2] * late(2, 3)
     assert got[6 + RIGHT] == pytest.approx(expected, abs=late(2, 3) / 2048 + 1e-5)
 
 
