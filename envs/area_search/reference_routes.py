@@ -138,7 +138,7 @@ class TeamRoutes:
                 if turn > 0 and i not in self.robbed:
                     continue
                 claims: dict[Cell, tuple[int, int]] = {}
-                for j in range(len(robots)):
+                for j in order:
                     if j != i and self.found[j]:
                         self.claim(j, claims)
                 self.robbed.discard(i)
