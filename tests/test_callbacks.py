@@ -20,7 +20,9 @@ from sb3_roles.baselines.area import area_scene
 from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback, TeamProgressBar
 from sb3_roles.common.checkpoint import read_checkpoint
+from sb3_roles.common.env_failures import EnvironmentFailed
 from sb3_roles.common.row_policies import MaskedRowPolicy, MaskWrapper
+from sb3_roles.evaluation import evaluators
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.evaluation.episodes import held_out_seed, selection_seed
 from sb3_roles.evaluation.evaluators import VecEnvEvaluator, make_evaluator
@@ -255,6 +257,24 @@ def test_other_environments_are_evaluated_on_other_streams_than_they_select_on()
         seen.append(watcher.first)
     assert np.array_equal(seen[1], seen[2])
     assert not np.any(seen[0] == seen[1])
+
+
+def test_an_episode_that_does_not_end_stops_an_evaluation(monkeypatch):
+    class Still:
+        policy = None
+
+        def predict(self, observations, *_):
+            return np.zeros(len(observations["observation"]), int), None
+
+    monkeypatch.setattr(evaluators, "MAX_EPISODE_STEPS", 7)
+    for horizon, ends in ((7, True), (8, False)):
+        env = TeamWrapper(make_team_vec_env(lambda horizon=horizon: PlainEnv(horizon), 2))
+        evaluator = VecEnvEvaluator(env, 4)
+        if ends:
+            assert evaluator(Still())["length"] == 7
+            continue
+        with pytest.raises(EnvironmentFailed, match=r"within 7 steps; .*check_episode_ends"):
+            evaluator(Still())
 
 
 def test_other_environments_are_evaluated_by_their_return():

@@ -276,6 +276,12 @@ def test_damaged_files_are_refused(tmp_path, content):
         path, _ = folder.newest()
     assert len(caught) == 1
     assert path.name == "step_000000000001.ckpt"
+    path.write_bytes(sound[:50])
+    with pytest.raises(CheckpointError) as refused:
+        folder.newest()
+    text = str(refused.value)
+    assert text.startswith(f"{newest}: ") and text.count(str(tmp_path)) == 1
+    assert text.endswith("; none of the 2 checkpoints can be taken")
 
 
 def rewrite(path, change):

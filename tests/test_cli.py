@@ -310,7 +310,8 @@ def test_full_disk_is_one_line():
     assert result.stderr == "sb3-roles simulate: error: No space left on device\n"
 
 
-def test_interrupt_ends_quietly():
+@pytest.mark.parametrize("n_signals", [1, 2, 3])
+def test_interrupt_ends_quietly(n_signals):
     process = subprocess.Popen(
         [*COMMAND, "simulate", "--episodes", "400000"],
         env=ENVIRONMENT,
@@ -321,7 +322,9 @@ def test_interrupt_ends_quietly():
         text=True,
     )
     time.sleep(3)
-    process.send_signal(signal.SIGINT)
+    for _ in range(n_signals):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.01)
     stdout, stderr = process.communicate(timeout=30)
     assert (process.returncode, stdout, stderr) == (130, "", "")
 

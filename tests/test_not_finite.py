@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import tempfile
 
 import numpy as np
 import pytest
@@ -201,3 +202,9 @@ def test_steps_that_nobody_looks_at_are_noticed(tmp_path, monkeypatch):
 def test_a_stock_algorithm_without_the_guard_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_roles.zoo.models.guard_optimizer", lambda policy: None)
     assert "weights or optimizer changed" in trial(tmp_path / "run", "ppo", "gradient")
+
+
+def test_stock_training_leaves_nothing_in_the_temporary_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert experiment._stock().startswith("SB3's PPO ")
+    assert not list(tmp_path.glob("SB3-*"))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
+import torch
 
 from sb3_roles.prove import promises
 from sb3_roles.prove.command import line
@@ -86,12 +88,15 @@ def test_exit_code_says_whether_all_were_kept(monkeypatch):
     assert main(["prove", "R2"]) == 1
 
 
-def test_an_interruption_keeps_the_table_of_what_was_tried(monkeypatch, tmp_path):
+def test_an_interruption_keeps_the_table_of_what_was_tried(monkeypatch, tmp_path, capsys):
     outcomes = {"R1": Outcome(2, 2, "kept"), "R2": KeyboardInterrupt()}
     seen = replaced(monkeypatch, outcomes)
     table = tmp_path / "table.md"
     assert main(["prove", "R1", "R2", "-o", str(table)]) == 130
-    assert "| R1 | " in table.read_text()
+    assert capsys.readouterr().err == "R2: stopped\n"
+    text = table.read_text()
+    assert "| R1 | " in text
+    assert f"torch {torch.__version__.partition('+')[0]}" in text
     assert not any(setting.folder.exists() for _, setting in seen)
 
 
@@ -122,12 +127,19 @@ def test_sigterm_ends_an_experiment_as_ctrl_c_does(monkeypatch):
     ("arguments", "words"),
     [
         (["R18"], ["'R18'", "R1"]),
+        (["r7"], ["unknown promise 'r7'", "did you mean 'R7'"]),
         (["R16", "--quick"], ["R16 has no short form"]),
         (["--seed", "-1"], ["from 0 to"]),
         (["-o", "table.txt"], [".md"]),
+        (["-o", f"{__file__}/table.md"], ["is no folder"]),
+        (["-o", "locked/table.md"], ["'locked' can not be written"]),
     ],
 )
-def test_command_refuses(arguments, words, capsys):
+def test_command_refuses(arguments, words, capsys, monkeypatch, tmp_path):
+    # Rights do not keep root out.
+    monkeypatch.chdir(tmp_path)
+    Path("locked").mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked")
     with pytest.raises(SystemExit) as stop:
         main(["prove", *arguments])
     assert stop.value.code == 2

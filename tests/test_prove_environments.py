@@ -224,8 +224,11 @@ def test_a_bug_that_is_not_found_breaks_the_promise(
 ) -> None:
     loss = planted.Bug("loss", "none at all", planted.RIGHT["loss"])
     monkeypatch.setattr(planted, "BUGS", (loss, planted.BUGS[-1]))
-    outcome = planted.bugs(Setting(True, tmp_path, 0))
+    notes: list[str] = []
+    outcome = planted.bugs(Setting(True, tmp_path, 0, notes.append))
     assert (outcome.held, outcome.tried) == (1, 2)
+    assert notes[0] == "missed none at all"
+    assert notes[1].startswith(f"caught {planted.BUGS[-1].name}: ")
     assert outcome.failures == ("loss: none at all: not found",)
     monkeypatch.setitem(planted.RIGHT, "loss", planted.BUGS[-1].planted)
     assert (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
+import tempfile
 import zipfile
 
 import numpy as np
@@ -124,7 +125,11 @@ def test_r5_reports_a_reader_that_verifies_nothing(tmp_path, monkeypatch):
         return first[0] if len(first) == 3 else first[-1]
 
     monkeypatch.setattr(corruption, "read_checkpoint", careless)
-    outcome = corruption.damaged(Setting(True, tmp_path, 0))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    outcome = corruption.damaged(Setting(True, tmp_path / "run", 0))
+    assert not list((tmp_path / "temporary").glob("SB3-*"))
     assert not outcome.kept
     assert any("other content was read" in line for line in outcome.failures)
 

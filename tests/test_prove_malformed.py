@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
 
 import pytest
@@ -82,8 +83,10 @@ def test_the_experiment_tells_which_case_failed(tmp_path, monkeypatch):
     assert any("n_steps: nonsense" in one for one in outcome.failures)
 
 
-def test_how_the_stock_algorithm_takes_nonsense():
+def test_how_the_stock_algorithm_takes_nonsense(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     assert len(NONSENSE) == 13
     assert stock_end("gamma", 1.5) == "trained"
     assert stock_end("batch_size", 0) == "named"
     assert stock_end("n_steps", 16) == "trained"
+    assert not list(tmp_path.glob("SB3-*"))

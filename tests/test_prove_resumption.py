@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 
 import numpy as np
 import pytest
@@ -86,8 +87,11 @@ def test_a_callback_that_forgets_its_episodes_is_reported(tmp_path, monkeypatch)
     assert found.startswith("state/")
 
 
-def test_stock_saving_is_compared_with_straight_stock_training(tmp_path):
+def test_stock_saving_is_compared_with_straight_stock_training(monkeypatch, tmp_path):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     said = resumption.stock_cuts(0, tmp_path / "stock", 2, (1,))
+    assert not list((tmp_path / "temporary").glob("SB3-*"))
     assert said.startswith("SB3's PPO after save, load, learn: other weights at 1 of 1 cuts, by up")
     assert "straight" not in said
 
@@ -222,6 +226,20 @@ def test_strict_resume_goes_on_where_nothing_differs(run, capsys):
     assert code == 0
     assert "not bit-exact" not in said.out
     assert CheckpointFolder(run / "checkpoints").newest()[1].manifest["env_steps"] == steps
+
+
+def test_that_the_newest_checkpoint_is_damaged_is_said_once(run, capsys):
+    folder = CheckpointFolder(run / "checkpoints")
+    newest, sound = folder.paths()[-1], folder.paths()[-1].read_bytes()
+    try:
+        newest.write_bytes(sound[:100])
+        newest.with_name("step_000000000001.ckpt").write_bytes(sound)
+        code, said = strict(capsys, run)
+    finally:
+        newest.write_bytes(sound)
+        newest.with_name("step_000000000001.ckpt").unlink(missing_ok=True)
+    assert code == 0
+    assert said.out.count("going back to step_000000000001.ckpt") == 1
 
 
 def test_without_it_the_differences_are_printed(run, capsys):

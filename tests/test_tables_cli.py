@@ -205,7 +205,7 @@ WRONG = [
     (["--runs", "hmapo=x"], "did you mean 'hmappo'?"),
     (["--runs", "hmappo"], "must be ROW=RUN"),
     (["--runs", "hmappo=x"], "x: no such run folder"),
-    (["--runs", "hmappo=."], "config.yml: No such file"),
+    (["--runs", "hmappo=."], "no run folder, without config.yml"),
     (["--runs", "random=."], "unknown learned row 'random'"),
     (["-o", "/proc/none"], "/proc/none"),
     (["-o", "plan.yml"], "--out: plan.yml is no folder"),

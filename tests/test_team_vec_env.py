@@ -1,6 +1,8 @@
 """The two backends of ``make_team_vec_env``: same trajectories, SB3's interface, clear errors."""
 
 import copy
+import re
+import sys
 import threading
 
 import numpy as np
@@ -13,12 +15,14 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 from toy_envs import BatchedToy, PlainEnv, ToyEnv
 
+from sb3_roles.common.env_failures import EnvironmentFailed
 from sb3_roles.common.team_vec_env import (
     NativeTeamVecEnv,
     SuperSuitTeamVecEnv,
     make_team_vec_env,
     team_seeds,
 )
+from sb3_roles.zoo.stop_signals import SecondSignal
 
 N_TEAMS, N_AGENTS = 4, BatchedToy.n_agents
 TOYS = [(ToyEnv, "native"), (ToyEnv, "supersuit")]
@@ -542,6 +546,89 @@ def test_steps_that_are_refused(env, message):
     vec_env.reset()
     with pytest.raises(ValueError, match=message):
         vec_env.step(np.zeros(4, int))
+
+
+class Failing(PlainEnv):
+    """Fails in its third step; what happens there is patched in."""
+
+    def step(self, actions):
+        return self.fail() if self.clock == 2 else super().step(actions)
+
+    def fail(self):
+        raise OSError("no such map:\nhard")
+
+
+def leave(env):
+    sys.exit(0)
+
+
+@pytest.mark.parametrize(
+    ("fail", "message"),
+    [
+        (None, r"OSError in step 3: no such map: hard \(test_team_vec_env.py:\d+\)"),
+        (leave, r"SystemExit in step 3: 0 \(test_team_vec_env.py:\d+\)"),
+        # What a library raises is told by the line that called it.
+        (lambda env: np.zeros(2).reshape(3), r"ValueError in step 3: .* \(test_team_vec_env.py"),
+        (lambda env: ({}, {}, {}, {}), r"step 3: expected 5 dicts by agent .*, got 4 values"),
+        (lambda env: ({}, {}, {}, {}, None), r"step 3: expected 5 dicts .*, got NoneType as info"),
+        (
+            lambda env: (env.observe(), {}, {}, {}, {"a": None}),
+            "what it returned can not be put together: TypeError: .* is not iterable",
+        ),
+    ],
+)
+def test_an_error_of_an_environment_is_told_as_such(monkeypatch, fail, message):
+    if fail is not None:
+        monkeypatch.setattr(Failing, "fail", fail)
+    vec_env = make_team_vec_env(Failing, 2, 0)
+    for _ in range(2):
+        vec_env.reset()
+        for _ in range(2):
+            vec_env.step(np.zeros(4, int))
+    with pytest.raises(EnvironmentFailed, match="environment test_team_vec_env:Failing: ") as seen:
+        vec_env.step(np.zeros(4, int))
+    assert re.search(message, str(seen.value))
+    assert "\n" not in str(seen.value)
+
+
+@pytest.mark.parametrize("name", ["observation_space", "action_space", "render", "close"])
+def test_so_is_one_outside_of_its_steps(monkeypatch, name):
+    def fail(env, agent=None):
+        raise RuntimeError("no window")
+
+    monkeypatch.setattr(PlainEnv, "render_mode", "rgb_array", raising=False)
+    vec_env = make_team_vec_env(PlainEnv, 1, 0)
+    vec_env.reset()
+    monkeypatch.setattr(PlainEnv, name, fail)
+    use = {"render": vec_env.render, "close": vec_env.close}
+    message = rf"toy_envs:PlainEnv: RuntimeError in {name}: no window \(test_team_vec_env.py:\d+\)"
+    with pytest.raises(EnvironmentFailed, match=message):
+        use.get(name, lambda: make_team_vec_env(PlainEnv, 1, 0))()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SecondSignal(143), MemoryError])
+def test_stops_and_a_lack_of_memory_pass_through_an_environment(monkeypatch, error):
+    def fail(env, actions):
+        raise error
+
+    monkeypatch.setattr(PlainEnv, "step", fail)
+    vec_env = make_team_vec_env(PlainEnv, 1, 0)
+    vec_env.reset()
+    with pytest.raises(error if isinstance(error, type) else SecondSignal):
+        vec_env.step(np.zeros(2, int))
+
+
+def test_an_error_of_a_batched_environment_is_told_as_such(monkeypatch):
+    vec_env = make_team_vec_env(ToyEnv, 2, 0)
+    vec_env.reset()
+
+    def step(actions):
+        raise KeyError("robot_7")
+
+    vec_env.batched.step = step
+    message = r"environment toy_envs:BatchedToy: KeyError in step\(\): 'robot_7' \(test_team"
+    with pytest.raises(EnvironmentFailed, match=message):
+        vec_env.step(np.zeros(6, int))
 
 
 def test_native_rewards_and_observations_are_checked():

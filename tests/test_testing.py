@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import importlib
 import warnings
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.losses import lambda_returns, stream_loss
 from sb3_roles.prove import planted_environments as planted
 from sb3_roles.prove.planted import BUGS, RIGHT, finding, found_by_pettingzoo
+from sb3_roles.testing.episodes import play
 
 N_STEPS = 30
 # Each check, and what it catches alone: planted bug, and words of the message.
@@ -32,6 +35,12 @@ CAUGHT_BY = {
     "check_actions_matter": (planted.ActionIgnored, ["'robot_2'", "steps 1 to 30"]),
     "check_batched_equals_single": (planted.BatchDiffers, ["team 0", "'robot_0'", "step 1 "]),
     "check_state_round_trip": (planted.ClockForgotten, ["'robot_0'", "step 12", "truncation"]),
+}
+
+NOT_OF_ENVIRONMENTS = {
+    "check_returns": lambda_returns,
+    "check_stream_loss": stream_loss,
+    "check_team_buffer": TeamRolloutBuffer,
 }
 
 
@@ -111,6 +120,103 @@ class ReachedByWriting(planted.SmallSearch):
         return observations, rewards, *rest
 
 
+class ClassCounts(planted.SmallSearch):
+    """Rewards grow with each reset of any instance."""
+
+    resets: ClassVar[int] = 0
+
+    def reset(self, seed=None, options=None):
+        ClassCounts.resets += 1
+        return super().reset(seed, options)
+
+    def step(self, actions):
+        observations, rewards, *rest = super().step(actions)
+        rewards = {agent: x + ClassCounts.resets / 10 for agent, x in rewards.items()}
+        return observations, rewards, *rest
+
+
+class ClassMap(planted.SmallSearch):
+    """A large array of each reset is that of the next one of any instance, moved on."""
+
+    shared: ClassVar[np.ndarray] = np.zeros(100, np.float32)
+
+    def reset(self, seed=None, options=None):
+        ClassMap.shared = ClassMap.shared + 1
+        return super().reset(seed, options)
+
+    def step(self, actions):
+        *parts, infos = super().step(actions)
+        for info in infos.values():
+            info["shared"] = ClassMap.shared.copy()
+        return *parts, infos
+
+
+class Unusual(planted.SmallSearch):
+    """Infos of what is equal, but not bit for bit, or only to itself."""
+
+    marker: ClassVar[object] = object()
+    resets: ClassVar[int] = 0
+
+    def reset(self, seed=None, options=None):
+        Unusual.resets += 1
+        self.sign = -1.0 if Unusual.resets % 2 else 1.0
+        return super().reset(seed, options)
+
+    def step(self, actions):
+        *parts, infos = super().step(actions)
+        for info in infos.values():
+            large = np.full(100, self.sign * 0.0)
+            large[0] = self.sign * np.nan
+            info.update(large=large, marker=self.marker, none=float("nan"), kinds={8, 0})
+        return *parts, infos
+
+
+class Stateless(planted.SmallSearch):
+    get_state = set_state = None
+
+
+class NoWayBack(planted.SmallSearch):
+    set_state = None
+
+
+class OddState(planted.SmallSearch):
+    def get_state(self):
+        return {**super().get_state(), "rngs": [object()]}
+
+    def set_state(self, state):
+        super().set_state({key: value for key, value in state.items() if key != "rngs"})
+
+
+class LiveState(toy_envs.PlainEnv):
+    """Its state is what it goes on to write into, and what it is given as well."""
+
+    def reset(self, seed=None, options=None):
+        result = super().reset(seed, options)
+        self.total = np.zeros(1)
+        return result
+
+    def step(self, actions):
+        self.total += sum(actions.values())
+        return super().step(actions)
+
+    def get_state(self):
+        return {
+            "total": self.total,
+            "clock": self.clock,
+            "agents": list(self.agents),
+            "rng": self.rng.bit_generator.state,
+        }
+
+    def set_state(self, state):
+        self.total, self.clock, self.agents = state["total"], state["clock"], state["agents"]
+        self.rng.bit_generator.state = state["rng"]
+
+
+class CopiedState(LiveState):
+    def get_state(self):
+        return copy.deepcopy(super().get_state())
+
+
 def said(check, *arguments, **options):
     """What a check says of what it refuses."""
     with pytest.raises(checks.ConformanceError) as caught:
@@ -154,6 +260,130 @@ def test_ends():
     message = said(checks.check_episode_ends, planted.HorizonTerminates, horizon=12)
     assert "step 12" in message and "expected a truncation" in message
     assert "step 5" in said(checks.check_episode_ends, planted.SmallSearch, horizon=5)
+
+
+@pytest.mark.parametrize("horizon", [13, 200])
+def test_a_truncation_before_the_horizon_is_refused(horizon):
+    for check in (checks.check_episode_ends, checks.check_parallel_env):
+        message = said(check, planted.SmallSearch, horizon=horizon)
+        assert "'robot_0', step 12 of episode 0: truncated before the horizon" in message
+        assert f"{horizon} steps" in message
+
+
+def test_a_termination_before_the_horizon_is_fine():
+    def make():
+        return planted.AreaSearchEnv(
+            height=9, width=9, n_targets=8, n_agents=3, horizon=40, early_stop_patience=3
+        )
+
+    ends = [m for m in play(make(), 40, 0) if m.step and not m.after]
+    assert ends and all(m.step < 40 and not any(m.truncation.values()) for m in ends)
+    checks.check_episode_ends(make, horizon=40)
+
+
+@pytest.mark.parametrize("check", [checks.check_determinism, checks.check_reset_forgets])
+def test_state_of_the_class_is_found(check):
+    message = said(check, ClassCounts, n_steps=N_STEPS)
+    assert "'robot_0', step 1 of episode 0: reward is" in message
+    assert "expected to be equal" in message and "share state, in the class" in message
+    message = said(check, ClassMap, n_steps=N_STEPS)
+    assert "info['shared'] is float32 (100,) with the digest" in message and "class" in message
+    check(Unusual, n_steps=N_STEPS)
+
+
+def test_an_instance_is_no_function_that_makes_one():
+    env = planted.SmallSearch()
+    for name in set(checks.__all__) - {"ConformanceError", *NOT_OF_ENVIRONMENTS}:
+        with pytest.raises(TypeError, match="instance of SmallSearch: give SmallSearch, or") as one:
+            getattr(checks, name)(env)
+        assert "make_env must be" in one_line(one.value)
+    with pytest.raises(TypeError, match=r"instance of NoneType$"):
+        checks.check_parallel_env(None)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        *(
+            (name, options, words)
+            for name in checks.__all__
+            if name.startswith("check_") and name != "check_episode_ends"
+            for options, words in [
+                ({"n_steps": 0}, "n_steps must be a whole number of at least 1, got 0"),
+                ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+            ]
+            if name not in NOT_OF_ENVIRONMENTS or "seed" in options
+        ),
+        ("check_episode_ends", {"seed": 0.5}, "seed must be"),
+        ("check_episode_ends", {"n_episodes": 0}, "n_episodes must be"),
+        ("check_episode_ends", {"horizon": 0}, "horizon must be .* at least 1, got 0"),
+        ("check_episode_ends", {"max_episode_steps": 0}, "max_episode_steps must be"),
+        ("check_seed_matters", {"n_seeds": 1}, "n_seeds must be .* at least 2, got 1"),
+        ("check_actions_matter", {"n_tries": 0}, "n_tries must be"),
+        ("check_batched_equals_single", {"n_teams": 0}, "n_teams must be"),
+        ("check_returns", {"n_rollouts": 0}, "n_rollouts must be"),
+        ("check_stream_loss", {"n_batches": 0}, "n_batches must be"),
+        ("check_team_buffer", {"steps": 0}, "steps must be"),
+        ("check_team_buffer", {"batches": ()}, r"len\(batches\) must be"),
+    ],
+)
+def test_numbers_that_are_not_allowed_are_named(name, options, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        getattr(checks, name)(NOT_OF_ENVIRONMENTS.get(name, planted.SmallSearch), **options)
+    one_line(caught.value)
+
+
+def test_numbers_of_numpy_are_allowed():
+    checks.check_determinism(planted.SmallSearch, n_steps=np.int64(14), seed=np.int64(2))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("myenvs", "module:name.*, got 'myenvs'"),
+        (":Good", "module:name.*, got ':Good'"),
+        ("no_such_module:Good", "'no_such_module:Good' can not be imported: ModuleNotFoundError"),
+        ("toy_envs:Good", "'toy_envs:Good' can not be imported: AttributeError"),
+    ],
+)
+def test_names_that_can_not_be_imported(name, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        checks.check_fresh_process(name)
+    one_line(caught.value)
+
+
+def test_what_an_environment_must_have_for_a_check_is_said():
+    with pytest.raises(ValueError, match="get_state and set_state, PlainEnv has neither"):
+        checks.check_state_round_trip(toy_envs.PlainEnv)
+    with pytest.raises(ValueError, match=r"batched\(n_teams\), which PlainEnv has not"):
+        checks.check_batched_equals_single(toy_envs.PlainEnv)
+    checks.check_parallel_env(Stateless, N_STEPS)
+
+
+def test_half_of_the_methods_of_a_state_is_refused():
+    for check in (checks.check_state_round_trip, checks.check_parallel_env):
+        message = said(check, NoWayBack, n_steps=N_STEPS)
+        assert "NoWayBack has get_state alone, expected get_state and set_state" in message
+
+
+def test_a_state_that_no_checkpoint_can_store_is_refused():
+    for check in (checks.check_state_round_trip, checks.check_parallel_env):
+        message = said(check, OddState, n_steps=N_STEPS)
+        assert message.startswith("get_state after the reset of episode 0: expected what can be")
+        assert "arrays of numbers" in message and "state/rngs/0 is a object" in message
+
+
+def test_a_state_must_be_a_copy():
+    checks.check_state_round_trip(CopiedState, n_steps=N_STEPS)
+    message = said(checks.check_state_round_trip, LiveState, n_steps=N_STEPS)
+    assert "reset of episode 0: get_state must return a copy" in message
+    assert "state['total'][0] is 0.0 and" in message
+
+
+def test_comparisons_say_what_was_expected():
+    for name in ("check_determinism", "check_reset_forgets", "check_batched_equals_single"):
+        message = said(getattr(checks, name), CAUGHT_BY[name][0], n_steps=N_STEPS)
+        assert ", expected to be equal" in message
 
 
 def test_a_new_process_plays_the_same_unless_hashes_matter():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import toy_envs
 import yaml
 
 from sb3_roles.common.checkpoint import CheckpointFolder
@@ -64,6 +66,8 @@ WRONG = [
     (["--device", "gpu"], "allowed are auto, cpu, cuda"),
     (["--num-threads", "0"], "from 1 to 1024"),
     (["--resume", "/no/such/run"], "no such run folder"),
+    (["--resume", ""], "argument --resume: must name a folder, got ''"),
+    (["-f", ""], "argument -f/--log-folder: must name a folder, got ''"),
     (["--resume", "x", "--seed", "3"], "leave --seed out"),
     (["--seed", str(2**32)], "from 0 to 4294967295"),
     (["--seed", str(2**32 - 1), "--n-seeds", "2"], "seed must be"),
@@ -460,6 +464,48 @@ def test_numbers_that_are_not_finite(tmp_path, monkeypatch, capsys, error):
     assert message.endswith("the loss is nan: no step was taken\n")
 
 
+@pytest.mark.parametrize("error", [SystemExit(0), OSError("bad memory"), KeyError("x")])
+@pytest.mark.parametrize("when", ["training", "evaluation"])
+def test_an_error_of_an_environment_is_one_line_and_one_exit_code(
+    tmp_path, monkeypatch, capsys, error, when
+):
+    def step(env, actions):
+        raise error
+
+    if when == "training":
+        monkeypatch.setattr(toy_envs.PlainEnv, "step", step)
+    else:
+        own = job._evaluate
+
+        def evaluate(*args):
+            monkeypatch.setattr(toy_envs.PlainEnv, "step", step)
+            own(*args)
+
+        monkeypatch.setattr(job, "_evaluate", evaluate)
+    env = ["--env", "toy_envs:PlainEnv", "--algo", "mappo", "-f", str(tmp_path), "-n", "32"]
+    assert main([*env, *SMALL, *FAST], "train") == 3
+    message = capsys.readouterr().err
+    run = tmp_path / "mappo" / "toy_envs-PlainEnv_1"
+    name = type(error).__name__
+    begin = f"train.py: error: {run}: environment toy_envs:PlainEnv: {name} in step 1: {error} ("
+    assert message.startswith(begin)
+    assert message.count("\n") == 1
+
+
+def test_the_command_that_goes_on_names_the_environment(tmp_path, monkeypatch, capsys):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    env = ["--env", "toy_envs:PlainEnv"]
+    words = [*env, "--algo", "mappo", "-f", str(tmp_path / "my logs"), "-n", "32"]
+    with monkeypatch.context() as patch:
+        patch.setattr(job, "_evaluate", interrupted)
+        assert main([*words, *SMALL, *FAST], "train") == 130
+    last = capsys.readouterr().out.splitlines()[-1]
+    command = shlex.split(last.removeprefix("stopped; to go on: "))
+    assert main(command[1:], command[0].removesuffix(".py")) == 0
+
+
 def test_a_foreign_environment(tmp_path):
     env = ["--env", "toy_envs:PlainEnv", "--algo", "hmappo", "-f", tmp_path, "-n", 64]
     result = train(*env, *SMALL, *FAST)
@@ -474,3 +520,43 @@ def test_a_foreign_environment(tmp_path):
     assert result.returncode == 0, result.stderr
     assert "not bit-exact: environment of this run offers no get_state" in result.stdout
     assert yaml.safe_load((run / "config.yml").read_text())["n_timesteps"] == 96
+
+
+def test_what_is_no_run_folder_names_the_runs_there(tmp_path, capsys):
+    for name in ("mappo/small_1", "mappo/small_2", "ppo/small_1"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "config.yml").write_text("x")
+    folder = tmp_path / "mappo"
+    code, _, err = run_main(capsys, "--resume", str(folder))
+    what = f"{folder}: no run folder, without config.yml; runs in {folder}: small_1, small_2\n"
+    assert (code, err) == (2, f"train.py: error: {what}")
+    _, _, err = run_main(capsys, "--resume", str(tmp_path / "nope"))
+    assert err.endswith(f"runs in {tmp_path}: mappo/small_1, mappo/small_2, ppo/small_1\n")
+    _, _, err = run_main(capsys, "--resume", str(folder / "smal_2"))
+    assert err.endswith(f"did you mean {str(folder / 'small_2')!r}?\n")
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "best"])
+def test_a_run_that_can_not_be_written_is_refused_before_anything_changes(logs, tmp_path, name):
+    run = tmp_path / "run"
+    shutil.copytree(logs[0] / "mappo" / "area-search-v0_1", run)
+    if name == "best":
+        (run / name).write_text("")
+    else:
+        (run / name).rename(tmp_path / "aside")
+        (run / name).write_text("")
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    with pytest.raises(SystemExit):
+        main(["--resume", str(run), "-n", "640"], "train")
+    assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+
+
+def test_what_keeps_a_checkpoint_from_fitting_is_named(logs, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(logs[0] / "mappo" / "area-search-v0_1", run)
+    config = yaml.safe_load((run / "config.yml").read_text())
+    write_yaml(run / "config.yml", {**config, "n_envs": 2})
+    code, _, err = run_main(capsys, "--resume", str(run), "-n", "640")
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "n_envs was 4, is 2" in err

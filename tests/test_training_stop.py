@@ -141,7 +141,7 @@ def test_a_signal_while_a_file_is_replaced_waits_for_it(tmp_path, monkeypatch):
 
 def test_the_second_signal_ends_at_once(monkeypatch):
     stop = StopSignals()
-    monkeypatch.setattr(stop_signals, "_SAME_STOP", 0.0)
+    monkeypatch.setattr(stop_signals, "SAME_STOP", 0.0)
     with pytest.raises(SystemExit) as end, stop.caught(), stop.held():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)
@@ -231,6 +231,60 @@ def test_a_finished_run_without_its_checkpoints_does_not_begin_anew(tmp_path, ca
         main(["--resume", str(run)], "train")
     assert end.value.code == 2
     assert "no checkpoint" in capfd.readouterr().err
+
+
+def stopped_in_the_update(tmp_path, monkeypatch):
+    """A run that was killed in its second iteration, before its first checkpoint."""
+    with monkeypatch.context() as patch:
+
+        def killed(*args, **kwargs):
+            raise SystemExit(9)
+
+        own, seen = ALGORITHMS["mappo"].load().train, []
+
+        def update(model):
+            seen.append(None)
+            return own(model) if len(seen) == 1 else killed()
+
+        patch.setattr(ALGORITHMS["mappo"].load(), "train", update)
+        with pytest.raises(SystemExit):
+            main(arguments(tmp_path, "mappo", "-f", str(tmp_path / "logs")), "train")
+    run = run_of(tmp_path / "logs")
+    assert (run / "progress.csv").exists() and steps_in(run) == []
+    return run
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_anew_and_says_what_is_dropped(
+    tmp_path, monkeypatch, capfd
+):
+    begin = arguments(tmp_path, "mappo")
+    assert main([*begin, "-f", str(tmp_path / "straight")], "train") == 0
+    run = stopped_in_the_update(tmp_path, monkeypatch)
+    before = (run / "progress.csv").read_bytes()
+    with pytest.raises(SystemExit) as end:
+        main(["--resume", str(run), "--strict-resume"], "train")
+    assert end.value.code == 2
+    said = f"train.py: error: --strict-resume: {run} has no checkpoint to go on from\n"
+    assert capfd.readouterr().err == said
+    assert (run / "progress.csv").read_bytes() == before
+    assert main(["--resume", str(run), "--verbose", "0"], "train") == 0
+    said = f"{run} has no checkpoint yet: it begins anew; the rows of progress.csv are dropped\n"
+    assert said in capfd.readouterr().out
+    assert run_difference(run_of(tmp_path / "straight"), run) is None
+
+
+def test_a_run_whose_folder_of_checkpoints_is_gone_does_not_begin_anew(
+    tmp_path, monkeypatch, capfd
+):
+    run = stopped_in_the_update(tmp_path, monkeypatch)
+    (run / CHECKPOINTS).rmdir()
+    before = {path.name: path.read_bytes() for path in run.glob("*.*")}
+    with pytest.raises(SystemExit) as end:
+        main(["--resume", str(run)], "train")
+    assert end.value.code == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert f"{run}: no checkpoint is left of what was trained" in line
+    assert {path.name: path.read_bytes() for path in run.glob("*.*")} == before
 
 
 def test_an_evaluation_that_is_broken_off_is_repeated(tmp_path, monkeypatch):

@@ -211,8 +211,9 @@ def unknown(what: str, given: object, allowed: Any) -> str:
     """
     names = [str(name) for name in allowed]
     # Not of a long text: that search takes minutes.
-    close = difflib.get_close_matches(str(given)[:100], names, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
+    folded = {name.lower(): name for name in names}
+    close = difflib.get_close_matches(str(given)[:100].lower(), folded, n=1)
+    hint = f"; did you mean {folded[close[0]]!r}?" if close else ""
     return f"unknown {what} {shown(given)}: allowed are {', '.join(names)}{hint}"
 
 

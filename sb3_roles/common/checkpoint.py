@@ -13,9 +13,9 @@ import hashlib
 import json
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import safetensors.numpy
@@ -44,6 +44,7 @@ from sb3_roles.common.files import remove_partial, replace_file
 from sb3_roles.common.plain_tree import encode_tree
 from sb3_roles.common.stored_zip import StoredZipError, pack
 
+T = TypeVar("T")
 SUFFIX = ".ckpt"
 _NAME = re.compile(r"step_([0-9]{12})\.ckpt")
 
@@ -167,14 +168,25 @@ class CheckpointFolder:
         :param weights_only: see :func:`read_checkpoint`
         :raises CheckpointError: if there is none
         """
-        reason = ""
-        for path in reversed(self.paths()):
+        return self.first(lambda path: read_checkpoint(path, check, weights_only))
+
+    def first(self, read: Callable[[Path], T]) -> tuple[Path, T]:
+        """Return the newest one that can be read; older ones are taken with a warning.
+
+        :param read: reads a file
+        :raises CheckpointError: if there is none; what is wrong with the newest is said
+        """
+        reason, paths = "", self.paths()
+        for path in reversed(paths):
             try:
-                checkpoint = read_checkpoint(path, check, weights_only)
+                found = read(path)
             except CheckpointError as error:
-                reason = reason or str(error)
+                said = str(error).removeprefix(f"{path}: ")
+                reason = reason or f"{path}: {said}"
                 continue
             if reason:
-                warnings.warn(f"{reason}; going back to {path.name}", stacklevel=2)
-            return path, checkpoint
+                warnings.warn(f"{reason}; going back to {path.name}", stacklevel=3)
+            return path, found
+        if len(paths) > 1:
+            reason += f"; none of the {len(paths)} checkpoints can be taken"
         raise CheckpointError(reason or f"{self.folder}: no checkpoint")

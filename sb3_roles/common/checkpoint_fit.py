@@ -13,6 +13,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common.checkpoint import CheckpointError
 from sb3_roles.common.checkpoint_reading import Outline
+from sb3_roles.common.env_failures import EnvironmentFailed
 from sb3_roles.common.names import one_line
 
 # Arrays that a state may have beside those whose size goes with the observations, and how many
@@ -29,7 +30,7 @@ def fitting() -> Iterator[None]:
     """
     try:
         yield
-    except CheckpointError:
+    except (CheckpointError, EnvironmentFailed):
         raise
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         message = f"the checkpoint does not fit the configuration: {one_line(error)}"

@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_roles.common.env_failures import called
+
 GoalNearness = Mapping[str, tuple[str, tuple[int, ...]]]
 """Goal set -> observation key, and index in a robot's array of that key."""
 
@@ -124,13 +126,13 @@ def check_homogeneous(env: ParallelEnv) -> None:
     Refuse environments whose agents differ.
 
     :param env: a PettingZoo environment
-    :raises ValueError: naming the agents and their spaces
+    :raises ValueError: naming the agents and their spaces, or what a space could not be had for
     """
     agents = list(env.possible_agents)
     if not agents:
         raise ValueError(f"{env} has no possible_agents: a team needs at least one")
     for kind in ("observation_space", "action_space"):
-        by_agent = {agent: getattr(env, kind)(agent) for agent in agents}
+        by_agent = {agent: called(env, kind, getattr(env, kind), agent) for agent in agents}
         odd = [agent for agent in agents if by_agent[agent] != by_agent[agents[0]]]
         if odd:
             raise ValueError(

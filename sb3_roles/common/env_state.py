@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from sb3_roles.common.base_team_vec_env import TeamVecEnv
+from sb3_roles.common.env_failures import called
 from sb3_roles.common.native_vec_env import NativeTeamVecEnv
 from sb3_roles.common.team_wrapper import find_team_env
 
@@ -60,8 +62,13 @@ def env_state(env: VecEnv) -> EnvState:
     teams = None
     if env_gap(env) is None:
         team_env = find_team_env(env)
-        teams = [team_env.env_method("get_state", indices=row)[0] for row in _team_rows(env)]
+        teams = [_state_of(team_env, row) for row in _team_rows(env)]
     return {"teams": teams, "wrappers": wrapper_states(env)}
+
+
+def _state_of(team_env: TeamVecEnv, row: int) -> Any:
+    (own,) = team_env.get_attr("get_state", indices=row)
+    return called(getattr(own, "__self__", own), "get_state()", own)
 
 
 def wrapper_states(env: VecEnv) -> list[Mapping[str, Any]]:

@@ -16,9 +16,10 @@ def closest(what: str, name: object, allowed: Iterable[object]) -> str:
     :param allowed: the known names, or numbers
     """
     known = {str(one): one for one in allowed}
+    folded = {one.lower(): known[one] for one in known}
     # Not of a long text: that search takes minutes.
-    close = difflib.get_close_matches(str(name)[:_LONGEST], known, n=1)
-    hint = f"; did you mean {known[close[0]]!r}?" if close else ""
+    close = difflib.get_close_matches(str(name)[:_LONGEST].lower(), folded, n=1)
+    hint = f"; did you mean {folded[close[0]]!r}?" if close else ""
     return f"unknown {what} {shown(name)}: allowed are {', '.join(known) or 'none'}{hint}"
 
 

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_roles.common.base_team_vec_env import TeamVecEnv
+from sb3_roles.common.env_failures import called
 
 
 class BatchedTeamEnv(Protocol):
@@ -130,13 +131,16 @@ class NativeTeamVecEnv(TeamVecEnv):
                 "environment's constructor or use backend='supersuit'"
             )
         if seeds is None:
-            self.batched.reset_teams(np.ones(self.n_teams, bool))
+            self._called("reset_teams", np.ones(self.n_teams, bool))
         else:
-            self.batched.reset(seed=seeds)
+            self._called("reset", seed=seeds)
         if not self._slots:
             self._check_observations()
             self._slots = [self._allocate() for _ in range(2)]
         return self._copy_observations()
+
+    def _called(self, method: str, *args: Any, **kwargs: Any) -> None:
+        called(self.batched, f"{method}()", getattr(self.batched, method), *args, **kwargs)
 
     def _lead(self, key: str) -> tuple[int, ...]:
         """Leading dimensions of a key's array in the batched environment."""
@@ -189,9 +193,11 @@ class NativeTeamVecEnv(TeamVecEnv):
 
         :return: observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos
         :raises NotFiniteError: if a reward or an observation is not finite
+        :raises EnvironmentFailed: if the environment raises
         """
         batched = self.batched
-        batched.step(self._actions.reshape(self.n_teams, self.n_agents, *self._actions.shape[1:]))
+        moves = self._actions.reshape(self.n_teams, self.n_agents, *self._actions.shape[1:])
+        self._called("step", moves)
         # Copies, here and below: SB3 adds the value at the horizon to the rewards in place.
         rewards = np.array(batched.rewards, np.float32).reshape(self.num_envs)
         self.reward_components = np.array(batched.reward_components, np.float32).reshape(
@@ -206,7 +212,7 @@ class NativeTeamVecEnv(TeamVecEnv):
         if done.any():
             self._check_last(batched.observations)
             self._add_terminal_infos(infos, done)
-            batched.reset_teams(done)
+            self._called("reset_teams", done)
         observations = self._copy_observations()
         self._check_seen(observations)
         return observations, rewards, np.repeat(done, self.n_agents), infos

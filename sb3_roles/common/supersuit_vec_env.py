@@ -1,7 +1,8 @@
 """Any PettingZoo environment through SuperSuit, with what SuperSuit breaks repaired."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,15 @@ from sb3_roles.common.env_declarations import (
     declared,
     declared_names,
 )
+from sb3_roles.common.env_failures import (
+    RESET_PARTS,
+    STEP_PARTS,
+    EnvironmentFailed,
+    called,
+    env_class,
+    parts_problem,
+)
+from sb3_roles.common.names import one_line
 
 Observations = dict[str, np.ndarray] | np.ndarray
 
@@ -30,7 +40,8 @@ class TeamRecorder(ParallelEnv):
     * Infos of a reset are kept aside: SuperSuit merges them over those of the terminal step.
     * Observations and infos of the terminal step are copied: an environment that reuses its arrays
       would overwrite them in that reset.
-    * Agents that are done before the others give a clear error.
+    * Agents that are done before the others give a clear error, and so does what the environment
+      raises; its steps are counted from the reset.
     * SuperSuit copies by pickling. That fails for windows, files and locks, and silently takes
       numpy views apart from the arrays they show (refused). Where there is a function that makes
       the environment, a copy is made by calling it instead.
@@ -55,6 +66,7 @@ class TeamRecorder(ParallelEnv):
             (len(self.possible_agents), len(self.component_names)), np.float32
         )
         self.metric_values = np.zeros(len(self.metric_names))
+        self._n_steps = 0
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         return (_record, (self.make,)) if self.make else super().__reduce_ex__(protocol)
@@ -71,8 +83,11 @@ class TeamRecorder(ParallelEnv):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Reset the environment; its infos go to ``reset_infos``, the returned ones are empty."""
-        observations, infos = self.env.reset(seed=seed, options=options)
-        self._check_alive(observations, "after reset()")
+        self._n_steps = 0
+        observations, infos = self._called(
+            "reset", RESET_PARTS, self.env.reset, seed=seed, options=options
+        )
+        self._check_alive(observations)
         self.reset_infos = [copy.deepcopy(infos.get(agent, {})) for agent in self.possible_agents]
         return observations, {}
 
@@ -86,17 +101,20 @@ class TeamRecorder(ParallelEnv):
         dict[str, dict[str, Any]],
     ]:
         """Step the environment and record components and metrics (see the class)."""
-        observations, rewards, terminations, truncations, foreign = self.env.step(actions)
-        self._check_alive(observations, "after step()")
+        self._n_steps += 1
+        observations, rewards, terminations, truncations, foreign = self._called(
+            f"step {self._n_steps}", STEP_PARTS, self.env.step, actions
+        )
+        self._check_alive(observations)
         infos: dict[str, dict[str, Any]] = {}
         for row, agent in enumerate(self.possible_agents):
             info = dict(foreign.get(agent, {}))
             if self.component_names:
-                self.component_values[row] = _take(
+                self.component_values[row] = self._take(
                     info, agent, "reward_components", self.component_names
                 )
             if self.metric_names:
-                values = _take(info, agent, "metrics", self.metric_names)
+                values = self._take(info, agent, "metrics", self.metric_names)
                 if row == 0:
                     self.metric_values[:] = values
             infos[agent] = copy.deepcopy(info) if info else info
@@ -108,56 +126,75 @@ class TeamRecorder(ParallelEnv):
         if over:
             running = [agent for agent in self.possible_agents if agent not in over]
             if running:
-                raise ValueError(
+                raise self._refused(
                     f"agents {over} are done while {running} are not: the agents of a team must "
                     "finish together. Keep them alive and idle to the end of the episode"
                 )
             observations = copy.deepcopy(observations)
         return observations, rewards, terminations, truncations, infos
 
-    def _check_alive(self, observations: Mapping[str, object], when: str) -> None:
+    def _called(
+        self,
+        where: str,
+        names: tuple[str, ...],
+        function: Callable[..., Any],
+        *args: Any,
+        **kw: Any,
+    ) -> Any:
+        result = called(self.env, where, function, *args, **kw)
+        problem = parts_problem(result, names)
+        if problem is not None:
+            raise self._refused(problem)
+        return result
+
+    def _check_alive(self, observations: Mapping[str, object]) -> None:
         missing = [agent for agent in self.possible_agents if agent not in observations]
         if missing:
-            raise ValueError(
-                f"no observation for agents {missing} {when}: all of {self.possible_agents} must "
+            raise self._refused(
+                f"no observation for agents {missing}: all of {self.possible_agents} must "
                 "be there from reset() to the end of the episode"
             )
 
+    def _take(
+        self, info: dict[str, Any], agent: str, key: str, names: tuple[str, ...]
+    ) -> list[float]:
+        """
+        Take the declared values of one kind out of an agent's info.
+
+        :param info: changed in place
+        :param agent: name of the agent, for the error
+        :param key: ``"reward_components"`` or ``"metrics"``
+        :param names: names that the environment declares
+        :raises EnvironmentFailed: if the key or one of the names is not there
+        """
+        values = info.pop(key, None)
+        if values is None:
+            raise self._refused(
+                f"infos[{agent!r}] has no {key!r}, although the environment declares {names}: put "
+                "a dict of floats there at every step, or do not declare them"
+            )
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise self._refused(
+                f"infos[{agent!r}][{key!r}] has {list(values)}, but not the declared {missing}"
+            )
+        return [values[name] for name in names]
+
+    def _refused(self, text: str) -> EnvironmentFailed:
+        where = f"step {self._n_steps}" if self._n_steps else "reset"
+        return EnvironmentFailed(f"environment {env_class(self.env)}: {where}: {text}")
+
     def render(self) -> Any:
         """Render the environment."""
-        return self.env.render()
+        return called(self.env, "render", self.env.render)
 
     def close(self) -> None:
         """Close the environment."""
-        self.env.close()
+        called(self.env, "close", self.env.close)
 
 
 def _record(make: Callable[[], ParallelEnv]) -> TeamRecorder:
     return TeamRecorder(make(), make)
-
-
-def _take(info: dict[str, Any], agent: str, key: str, names: tuple[str, ...]) -> list[float]:
-    """
-    Take the declared values of one kind out of an agent's info.
-
-    :param info: changed in place
-    :param agent: name of the agent, for the error
-    :param key: ``"reward_components"`` or ``"metrics"``
-    :param names: names that the environment declares
-    :raises ValueError: if the key or one of the names is not there
-    """
-    values = info.pop(key, None)
-    if values is None:
-        raise ValueError(
-            f"infos[{agent!r}] has no {key!r}, although the environment declares {names}: put a "
-            "dict of floats there at every step, or do not declare them"
-        )
-    missing = [name for name in names if name not in values]
-    if missing:
-        raise ValueError(
-            f"infos[{agent!r}][{key!r}] has {list(values)}, but not the declared {missing}"
-        )
-    return [values[name] for name in names]
 
 
 class SuperSuitTeamVecEnv(TeamVecEnv):
@@ -217,14 +254,28 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
 
     def _reset_all(self, seeds: list[int] | None, options: list[dict[str, Any]]) -> Observations:
         # One by one: SuperSuit's own reset would seed copy i with seed + i.
-        parts = [
-            copied.reset(seed=None if seeds is None else seeds[team], options=options[team] or None)
-            for team, copied in enumerate(self._vec.vec_envs)
-        ]
-        observations = self._vec.concat_obs([part[0] for part in parts])
+        with self._telling():
+            parts = [
+                copied.reset(seed=seeds and seeds[team], options=options[team] or None)
+                for team, copied in enumerate(self._vec.vec_envs)
+            ]
+            observations = self._vec.concat_obs([part[0] for part in parts])
         self.reset_infos = [info for recorder in self._recorders for info in recorder.reset_infos]
         self._check_team_keys(observations)
         return self._collapse(observations)
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Tell what SuperSuit fails on, such as an observation of another shape."""
+        try:
+            yield
+        except EnvironmentFailed:
+            raise
+        except (TypeError, LookupError, AttributeError, ValueError) as error:
+            raise EnvironmentFailed(
+                f"environment {env_class(self._recorders[0].env)}: what it returned can not be put "
+                f"together: {type(error).__name__}: {one_line(error)}"
+            ) from error
 
     def _check_team_keys(self, observations: Observations) -> None:
         """Refuse a wrong declaration; at resets only, because it reads every map."""
@@ -252,10 +303,11 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
 
         :return: observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos
         :raises NotFiniteError: if a reward or an observation is not finite
-        :raises ValueError: if agents do not finish together, or a declared reward component or
-            metric is missing
+        :raises EnvironmentFailed: if the environment raises or returns something else than dicts,
+            agents do not finish together, or a declared reward component or metric is missing
         """
-        observations, rewards, terminated, truncated, infos = self._vec.step(self._actions)
+        with self._telling():
+            observations, rewards, terminated, truncated, infos = self._vec.step(self._actions)
         if self.component_names:
             self.reward_components = np.concatenate([r.component_values for r in self._recorders])
         self._check_rewards(rewards)

@@ -14,11 +14,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from area_search.scenes import Scene, get_scene
 from sb3_roles.baselines.area import area_scenes
 from sb3_roles.common.callbacks import Evaluate
+from sb3_roles.common.env_failures import EnvironmentFailed
+from sb3_roles.common.env_state import env_name
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.common.thresholds import first_above
 from sb3_roles.evaluation.episodes import run_episodes, stream_seed
 from sb3_roles.evaluation.metrics import t90
 from sb3_roles.evaluation.policies import PolicyController
+
+MAX_EPISODE_STEPS = 100_000
+"""Of an episode of an environment that is not area search; most are of hundreds."""
 
 
 class SceneEvaluator:
@@ -165,6 +170,7 @@ class VecEnvEvaluator:
         :param model: any SB3 model
         :return: ``return`` (sum over the robots of a team), ``length``, the numbers in the
             environment's ``episode_metrics``, and ``n_episodes``; means
+        :raises EnvironmentFailed: if an episode is longer than :data:`MAX_EPISODE_STEPS`
         """
         masked = isinstance(model.policy, MaskableActorCriticPolicy) and is_masking_supported(
             self.env
@@ -183,6 +189,11 @@ class VecEnvEvaluator:
             observations, rewards, starts, infos = self.env.step(actions)
             returns += np.asarray(rewards).reshape(teams, agents).sum(axis=1)
             length += 1
+            if length.max() > MAX_EPISODE_STEPS:
+                raise EnvironmentFailed(
+                    f"{env_name(self.env)}: an episode of the evaluation has not ended within "
+                    f"{MAX_EPISODE_STEPS:,} steps; sb3_roles.testing.check_episode_ends tells when"
+                )
             for team in np.flatnonzero(starts[::agents]):
                 if left[team] > 0:
                     left[team] -= 1

@@ -7,6 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,10 +36,10 @@ def add_parser(subparsers: Subparsers) -> None:
         "promises",
         nargs="*",
         type=one_of("promise", PROMISES),
-        metavar="R1",
-        help="those to try (default: all; with --quick all that have a short form)",
+        metavar="PROMISE",
+        help="those to try, such as R1 R5 (default: all; with --quick all with a short form)",
     )
-    parser.add_argument("--quick", action="store_true", help="short forms, seconds each")
+    parser.add_argument("--quick", action="store_true", help="short forms, up to a minute each")
     parser.add_argument(
         "--seed",
         type=whole_number(0, MAX_TRAINING_SEED),
@@ -71,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace) -> int:
     from sb3_roles.common.files import write_atomically
     from sb3_roles.prove.table import results_page
+    from sb3_roles.zoo.launcher import prepare_process
     from sb3_roles.zoo.machine import describe_machine
     from sb3_roles.zoo.options import UsageError
 
@@ -81,7 +83,10 @@ def _run(args: argparse.Namespace) -> int:
     asked = [PROMISES[name] for name in names] or [
         one for one in PROMISES.values() if one.has_quick or not args.quick
     ]
-    machine, results = describe_machine(), []
+    packages = {"torch": version("torch"), "stable_baselines3": version("stable_baselines3")}
+    machine, results = {**describe_machine(), **packages}, []
+    # Experiments train in this process, too.
+    prepare_process()
     for promise in asked:
         outcome, seconds = _try(promise, args.quick, args.seed)
         print(line(promise, outcome, seconds), flush=True)
@@ -119,6 +124,9 @@ def _try(promise: Promise, quick: bool, seed: int) -> tuple[Outcome, float]:
 
     try:
         outcome = promise.prove(Setting(quick, folder, seed, note))
+    except KeyboardInterrupt:
+        note("stopped")
+        raise
     except Exception as error:
         # The others shall be tried.
         text = f"{type(error).__name__}: {one_line(error)}"

@@ -125,6 +125,7 @@ def _stock(setting: Setting) -> str:
     weights: dict[str, th.Tensor] = {}
     for seed in (1, 2):
         model = PPO("MlpPolicy", "CartPole-v1", seed=seed, device="cpu", n_steps=8, batch_size=8)
+        model.set_logger(Logger(None, []))
         model.learn(8)
         model.save(setting.folder / "stock.zip")
         raw.append((setting.folder / "stock.zip").read_bytes())

@@ -233,6 +233,7 @@ def stock_end(name: str, value: Any) -> str:
     :return: ``trained``, ``named`` (the constructor's error names the setting), or ``crashed``
     """
     from stable_baselines3 import PPO
+    from stable_baselines3.common.logger import Logger
 
     small: dict[str, Any] = {"n_steps": 16, "batch_size": 8, "n_epochs": 2, "device": "cpu"}
     with warnings.catch_warnings():
@@ -241,6 +242,7 @@ def stock_end(name: str, value: Any) -> str:
             model = PPO("MlpPolicy", "CartPole-v1", seed=0, **{**small, name: value})
         except Exception as error:
             return "named" if name in str(error) else "crashed"
+        model.set_logger(Logger(None, []))  # Without one, SB3 makes a folder for its log.
         try:
             model.learn(64)
         except Exception:

@@ -197,7 +197,9 @@ COMMAND_LINES: tuple[Case, ...] = (
     Case(("train.py", "--algo", "hm\nappo\x07"), ("'hm\\nappo\\x07'", "did you mean 'hmappo'?")),
     _words("train.py --resume nowhere", "nowhere: no such run folder"),
     _words("train.py --resume nowhere --seed 3", "leave --seed out"),
-    Case(("train.py", "--resume", "run"), ("config.yml: No such file",), files={"run/": ""}),
+    Case(
+        ("train.py", "--resume", "run"), ("no run folder, without config.yml",), files={"run/": ""}
+    ),
     Case(
         ("train.py", "--resume", "run"),
         ("config.yml", "later_key", "allowed are"),

@@ -256,11 +256,13 @@ class _OneBadReward(gym.RewardWrapper[Any, Any]):
 
 def _stock() -> str:
     from stable_baselines3 import PPO
+    from stable_baselines3.common.logger import Logger
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         env = _OneBadReward(gym.make("CartPole-v1"))
         model = PPO("MlpPolicy", env, n_steps=16, batch_size=8, n_epochs=2, seed=0, device="cpu")
+        model.set_logger(Logger(None, []))
         try:
             model.learn(160)
             end = "trained on"

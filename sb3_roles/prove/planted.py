@@ -123,7 +123,7 @@ def bugs(setting: Setting) -> Outcome:
         held += said is not None
         if said is None:
             failures.append(f"{bug.kind}: {bug.name}: not found")
-        setting.note(f"{bug.kind}, {bug.name}: {said or 'not found'}")
+        setting.note(f"missed {bug.name}" if said is None else f"caught {bug.name}: {said}")
     in_environments = [bug for bug in BUGS if bug.kind == "environment"]
     by_stock = sum(found_by_pettingzoo(bug.planted) for bug in in_environments)
     return Outcome(

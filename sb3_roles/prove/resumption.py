@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.logger import Logger
 
 from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
 from sb3_roles.prove.promises import Outcome, Setting
@@ -266,6 +267,7 @@ def _learn(
     env = make_env(config)
     rows = ITERATION * env.num_envs // TEAMS
     model: Any = make_model(config, env, "cpu")
+    model.set_logger(Logger(None, []))
     model.learn((cut or n_iterations) * rows)
     if cut is not None:
         model.save(folder / "model")
@@ -273,6 +275,7 @@ def _learn(
         stir(100)
         env = make_env(config)
         model = type(model).load(folder / "model", env=env, device="cpu")
+        model.set_logger(Logger(None, []))
         model.learn((n_iterations - cut) * rows, reset_num_timesteps=False)
     env.close()
     return {name: one.clone() for name, one in model.policy.state_dict().items()}

@@ -12,6 +12,7 @@ from sb3_roles.testing.episodes import (
     ConformanceError,
     MakeEnv,
     Moment,
+    check_given,
     difference,
     guard,
     reset,
@@ -34,8 +35,16 @@ def check_batched_equals_single(
     :param seed: of the first team; each team has a seed of its own
     :param n_teams: teams in the batch
     :raises ConformanceError: naming team, agent, step, and the first value that differs
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps, n_teams=n_teams)
     singles = [make_env() for _ in range(n_teams)]
+    if not callable(getattr(singles[0], "batched", None)):
+        raise ValueError(
+            "make_env must make an environment with batched(n_teams), which "
+            f"{type(singles[0]).__name__} has not"
+        )
     batch = singles[0].batched(n_teams)
     seeds = [seed + m for m in range(n_teams)]
     guard("reset of the batch", batch.reset, seeds)
@@ -62,7 +71,7 @@ def check_batched_equals_single(
 def _differ(m: int, agent: Any, moment: Moment, text: str) -> ConformanceError:
     return ConformanceError(
         f"team {m}, agent {agent!r}, {moment.where}: of the single environment and the batched "
-        f"form, {text}"
+        f"form, {text}, expected to be equal"
     )
 
 

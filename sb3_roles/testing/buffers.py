@@ -10,6 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_roles.common.checks import check_positive, check_whole
 from sb3_roles.common.policies import Streams
 from sb3_roles.testing.episodes import ConformanceError
 from sb3_roles.testing.returns import Rollout, check_same_returns, slow_returns
@@ -199,7 +200,12 @@ def check_team_buffer(
     :param steps: steps of a rollout
     :param batches: sizes of minibatches in teams to try
     :raises ConformanceError: naming agent or row, step, and what was expected
+    :raises ValueError: if a number is not allowed
     """
+    check_whole(0, seed=seed)
+    check_positive(
+        n_teams=n_teams, n_agents=n_agents, steps=steps, **{"len(batches)": len(batches)}
+    )
     buffer = make_buffer(
         steps,
         _SPACE,

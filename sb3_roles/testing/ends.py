@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from sb3_roles.common.checks import check_positive
 from sb3_roles.testing.episodes import (
     ConformanceError,
     MakeEnv,
     Moment,
+    check_given,
     compare,
     difference,
     frozen,
@@ -29,6 +31,8 @@ def check_episode_ends(
 ) -> None:
     """Check that episodes end, and that a known horizon truncates them and does not terminate.
 
+    Before the horizon an episode may terminate, but not be truncated.
+
     A horizon that is reported as a termination teaches a critic that nothing would have followed.
 
     Example: ``check_episode_ends(MyEnv, horizon=50)``
@@ -39,7 +43,12 @@ def check_episode_ends(
     :param n_episodes: episodes to play
     :param seed: of play
     :raises ConformanceError: naming agent and step
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, max_episode_steps=max_episode_steps, n_episodes=n_episodes)
+    if horizon is not None:
+        check_positive(horizon=horizon)
     limit = horizon or max_episode_steps
     env, ended = make_env(), 0
     for moment in play(env, n_episodes * limit, seed):
@@ -47,8 +56,8 @@ def check_episode_ends(
             ended += 1
             if ended == n_episodes:
                 return
-        if horizon is not None and moment.step == horizon:
-            _check_horizon(moment)
+        if horizon is not None:
+            _check_horizon(moment, horizon)
         if moment.step >= limit and moment.after:
             raise ConformanceError(
                 f"agent {moment.after[0]!r}, {moment.where}: expected the episode to have ended "
@@ -56,8 +65,14 @@ def check_episode_ends(
             )
 
 
-def _check_horizon(moment: Moment) -> None:
-    for agent in moment.before:
+def _check_horizon(moment: Moment, horizon: int) -> None:
+    for agent, truncated in moment.truncation.items():
+        if truncated and moment.step < horizon:
+            raise ConformanceError(
+                f"agent {agent!r}, {moment.where}: truncated before the horizon, expected after "
+                f"{horizon} steps only: is horizon={horizon} that of the environment?"
+            )
+    for agent in moment.before if moment.step == horizon else ():
         if moment.truncation.get(agent):
             continue
         if moment.termination.get(agent):
@@ -76,7 +91,10 @@ def check_agents_live_together(make_env: MakeEnv, n_steps: int = 200, seed: int 
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent and step
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
     env = make_env()
     possible = list(env.possible_agents)
     for moment in play(env, n_steps, seed):
@@ -108,7 +126,10 @@ def check_no_aliasing(make_env: MakeEnv, n_steps: int = 200, seed: int = 0) -> N
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent and step of the value that changed
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
     kept: deque[tuple[Moment, Moment]] = deque(maxlen=_KEPT)
     for moment in play(make_env(), n_steps, seed):
         for given, copied in kept:

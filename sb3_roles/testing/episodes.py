@@ -9,14 +9,36 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from sb3_roles.common.checks import check_positive, check_whole
+from sb3_roles.common.env_failures import RESET_PARTS, STEP_PARTS, parts_problem, place_of
+from sb3_roles.common.names import one_line
+
 MakeEnv = Callable[[], Any]
 """Makes a new environment at each call: the environment's class, for example."""
-
-PARTS = ("observation", "reward", "termination", "truncation", "info")
 
 
 class ConformanceError(AssertionError):
     """Something does not do what it should; the message, one line, says where and what."""
+
+
+def check_given(make_env: Any, seed: int, **counts: int) -> None:
+    """Refuse wrong arguments of a check, which would look like faults of the environment.
+
+    :param make_env: makes a new environment
+    :param seed: of play
+    :param counts: name -> number, at least 1
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: naming the first wrong number
+    """
+    if not callable(make_env):
+        name = type(make_env).__name__
+        raise TypeError(
+            "make_env must be a class or function that makes a new environment at each call, got "
+            f"an instance of {name}"
+            + (f": give {name}, or lambda: {name}(...)" if hasattr(make_env, "reset") else "")
+        )
+    check_whole(0, seed=seed)
+    check_positive(**counts)
 
 
 class Moment(NamedTuple):
@@ -42,7 +64,7 @@ class Moment(NamedTuple):
 
     def parts(self) -> dict[str, dict[Any, Any]]:
         """Return the dicts by name; of a reset only those that it returns."""
-        names = PARTS if self.step else ("observation", "info")
+        names = STEP_PARTS if self.step else RESET_PARTS
         return {name: getattr(self, name) for name in names}
 
 
@@ -55,7 +77,7 @@ class Actions:
     """
 
     def __init__(self, seed: int) -> None:
-        self._seed = seed
+        self._seed = int(seed)
         self._spaces: dict[Any, spaces.Space] = {}
 
     def draw(self, env: Any, last: Moment) -> dict[Any, Any]:
@@ -91,8 +113,8 @@ def reset(env: Any, episode: int = 0, seed: int | None = None) -> Moment:
     :raises ConformanceError: if it fails, or returns something else than two dicts
     """
     where = f"reset of episode {episode}"
-    options = {} if seed is None else {"seed": seed}
-    result = _dicts(where, guard(where, env.reset, **options), ("observation", "info"))
+    options = {} if seed is None else {"seed": int(seed)}
+    result = _dicts(where, guard(where, env.reset, **options), RESET_PARTS)
     agents = tuple(env.agents)
     return Moment(episode, 0, agents, agents, result[0], {}, {}, {}, result[1])
 
@@ -107,7 +129,7 @@ def step(env: Any, last: Moment, actions: dict[Any, Any]) -> Moment:
     """
     before, number = tuple(env.agents), last.step + 1
     where = f"step {number} of episode {last.episode}"
-    result = _dicts(where, guard(where, env.step, actions), PARTS)
+    result = _dicts(where, guard(where, env.step, actions), STEP_PARTS)
     return Moment(last.episode, number, before, tuple(env.agents), *result)
 
 
@@ -152,20 +174,14 @@ def guard(where: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -
     try:
         return function(*args, **kwargs)
     except Exception as error:
-        said = " ".join(str(error).split())
+        said = f"{one_line(error)}{place_of(error)}"
         raise ConformanceError(f"{where}: it raised {type(error).__name__}: {said}") from error
 
 
 def _dicts(where: str, result: Any, names: tuple[str, ...]) -> list[dict[Any, Any]]:
-    expected = f"{len(names)} dicts by agent ({', '.join(names)})"
-    if not isinstance(result, tuple) or len(result) != len(names):
-        got = f"{len(result)} values" if isinstance(result, tuple) else type(result).__name__
-        raise ConformanceError(f"{where}: expected {expected}, got {got}")
-    for name, part in zip(names, result, strict=True):
-        if not isinstance(part, dict):
-            raise ConformanceError(
-                f"{where}: expected {expected}, got {type(part).__name__} as {name}"
-            )
+    problem = parts_problem(result, names)
+    if problem is not None:
+        raise ConformanceError(f"{where}: {problem}")
     return list(result)
 
 
@@ -215,14 +231,18 @@ def compare(first: Moment, second: Moment, why: str) -> None:
         for agent in (*part, *(agent for agent in other if agent not in part)):
             if (agent in part) != (agent in other):
                 raise ConformanceError(
-                    f"agent {agent!r}, {first.where}: only one of two plays has its {name}; {why}"
+                    f"agent {agent!r}, {first.where}: only one of two plays has its {name}, "
+                    f"expected both or neither: {why}"
                 )
             text = difference(part[agent], other[agent], name)
             if text:
-                raise ConformanceError(f"agent {agent!r}, {first.where}: {text}; {why}")
+                raise ConformanceError(
+                    f"agent {agent!r}, {first.where}: {text}, expected to be equal: {why}"
+                )
     if first.after != second.after:
         raise ConformanceError(
-            f"{first.where}: env.agents is {list(first.after)} and {list(second.after)}; {why}"
+            f"{first.where}: env.agents is {list(first.after)} and {list(second.after)}, expected "
+            f"to be equal: {why}"
         )
 
 

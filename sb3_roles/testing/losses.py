@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_roles.common.checks import check_positive, check_whole
 from sb3_roles.testing.episodes import ConformanceError
 
 LossFunction = Callable[..., Any]
@@ -166,7 +167,10 @@ def check_stream_loss(loss_function: LossFunction, seed: int = 0, n_batches: int
     :param seed: of the minibatches
     :param n_batches: how many to try
     :raises ConformanceError: naming the term, or the row of a gradient, and what was expected
+    :raises ValueError: if a number is not allowed
     """
+    check_whole(0, seed=seed)
+    check_positive(n_batches=n_batches)
     plain = Coefficients(clip_range=0.2, ent_coef=0.0, vf_coef=0.0, kl_coef=0.0)
     whole = Coefficients(clip_range=0.2, ent_coef=0.03, vf_coef=0.7, kl_coef=0.4)
     for k in range(n_batches):

@@ -9,7 +9,7 @@ from sb3_roles.testing.ends import (
     check_episode_ends,
     check_no_aliasing,
 )
-from sb3_roles.testing.episodes import MakeEnv
+from sb3_roles.testing.episodes import MakeEnv, check_given
 from sb3_roles.testing.seeds import (
     check_actions_matter,
     check_determinism,
@@ -17,6 +17,7 @@ from sb3_roles.testing.seeds import (
     check_reset_forgets,
     check_seed_matters,
     check_state_round_trip,
+    state_methods,
 )
 from sb3_roles.testing.values import (
     check_agents,
@@ -41,8 +42,8 @@ def check_parallel_env(
     """Check a PettingZoo parallel environment: everything of this package that applies to it.
 
     Beside PettingZoo's own ``parallel_api_test`` and ``parallel_seed_test``, which see neither
-    values nor the steps after the first. ``get_state`` with ``set_state``, and ``batched``, are
-    checked where the environment has them.
+    values nor the steps after the first. ``get_state`` and ``set_state``, and ``batched``, are
+    checked where the environment has them; one of the two alone is refused.
 
     Example::
 
@@ -55,13 +56,17 @@ def check_parallel_env(
     :param n_steps: steps of each check; some play as many several times
     :param seed: of play
     :param max_episode_steps: steps within which every episode ends
-    :param horizon: steps after which an episode is truncated, if there is such a number
+    :param horizon: steps after which an episode is truncated, and not before, if there is such a
+        number
     :param live_together: whether all agents start and end together, which teams need
     :param has_chance: whether another seed gives another play
     :param fresh_process: whether to compare with a new process, too; that takes seconds, and
         ``make_env`` must be importable there, see :func:`check_fresh_process`
     :raises ConformanceError: an AssertionError of one line: agent, step, what was expected
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
     check_agents(make_env, n_steps, seed)
     if live_together:
         check_agents_live_together(make_env, n_steps, seed)
@@ -74,7 +79,7 @@ def check_parallel_env(
         check_seed_matters(make_env, n_steps, seed)
     check_actions_matter(make_env, n_steps, seed)
     env = make_env()
-    if declared(env, "get_state") is not None and declared(env, "set_state") is not None:
+    if state_methods(env):
         check_state_round_trip(make_env, n_steps, seed)
     # A wrapper is left out by the batched form of what it wraps.
     if declared(env, "batched") is not None and env is env.unwrapped:

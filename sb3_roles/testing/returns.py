@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_roles.common.checks import check_positive, check_whole
 from sb3_roles.testing.episodes import ConformanceError
 
 ReturnsFunction = Callable[..., th.Tensor]
@@ -136,7 +137,10 @@ def check_returns(function: ReturnsFunction, seed: int = 0, n_rollouts: int = 3)
     :param seed: of the rollouts
     :param n_rollouts: how many to try
     :raises ConformanceError: naming step, row and stream
+    :raises ValueError: if a number is not allowed
     """
+    check_whole(0, seed=seed)
+    check_positive(n_rollouts=n_rollouts)
     gamma, gae_lambda = np.array([0.9, 0.7, 1.0, 0.5]), np.array([0.95, 0.4, 1.0, 0.0])
     for k in range(n_rollouts):
         rollout = random_rollout(seed + k, steps=7 + 8 * k, streams=len(gamma))

@@ -2,37 +2,39 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from importlib import import_module
 from typing import Any
 
-import numpy as np
-
+from sb3_roles.common.checks import check_whole
+from sb3_roles.common.plain_tree import encode_tree
 from sb3_roles.testing.episodes import (
     Actions,
     ConformanceError,
     MakeEnv,
-    Moment,
+    check_given,
     compare,
     difference,
     frozen,
     go_on,
+    guard,
     play,
     reset,
     step,
 )
+from sb3_roles.testing.notes import digests, noted, noted_play
 
 _N_STEPS = 200
+_ALONE = "; do instances share state, in the class or the module?"
 
 
 def check_determinism(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 0) -> None:
     """Check that two instances with one seed and the same actions return the same, at every step.
 
-    Resets without a seed belong to it: they go on with the stream of the first one.
+    Resets without a seed belong to it: they go on with the stream of the first one. Two instances
+    play side by side, and one before them to its end: what instances share shows only there.
 
     Example: ``check_determinism(MyEnv, n_steps=1000)``
 
@@ -40,10 +42,16 @@ def check_determinism(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 0)
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent, step, and the first value that differs
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
+    earlier = noted_play(make_env, n_steps, seed)
     first, second = (play(make_env(), n_steps, seed) for _ in range(2))
-    for one, other in zip(first, second, strict=True):
-        compare(one, other, f"two instances with seed {seed} and the same actions")
+    with_same = f"with seed {seed} and the same actions"
+    for before, one, other in zip(earlier, first, second, strict=True):
+        compare(one, other, f"two instances {with_same}")
+        compare(before, noted(one), f"an instance and a later one {with_same}{_ALONE}")
 
 
 def check_reset_forgets(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 0) -> None:
@@ -57,15 +65,21 @@ def check_reset_forgets(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent, step, and the first value that differs
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
+    alone = noted_play(make_env, n_steps, seed)
+    later = f"a new environment with seed {seed}, and later a reset of another one with it{_ALONE}"
     used = make_env()
     for earlier in (3, n_steps):
         for _ in play(used, earlier, seed + 1):
             pass
         why = f"a reset with seed {seed} after other play, and a new environment"
         again, fresh = play(used, n_steps, seed), play(make_env(), n_steps, seed)
-        for one, other in zip(again, fresh, strict=True):
+        for before, one, other in zip(alone, again, fresh, strict=True):
             compare(one, other, why)
+            compare(before, noted(one), later)
 
 
 def check_seed_matters(
@@ -82,10 +96,14 @@ def check_seed_matters(
     :param seed: of the actions, and the first of the seeds
     :param n_seeds: seeds to try
     :raises ConformanceError: if all play the same
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
-    expected = _notes(make_env, n_steps, seed, seed)
+    check_given(make_env, seed, n_steps=n_steps)
+    check_whole(2, n_seeds=n_seeds)
+    expected = digests(make_env, n_steps, seed, seed)
     for other in range(seed + 1, seed + n_seeds):
-        if _notes(make_env, n_steps, other, seed) != expected:
+        if digests(make_env, n_steps, other, seed) != expected:
             return
     raise ConformanceError(
         f"reset to step {n_steps}, all agents: seeds {seed} to {seed + n_seeds - 1} give the same "
@@ -105,7 +123,10 @@ def check_actions_matter(
     :param seed: of play
     :param n_tries: other choices of actions to try for each agent
     :raises ConformanceError: naming the agent whose actions change nothing
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps, n_tries=n_tries)
     env = make_env()
     for agent in env.possible_agents:
         tries = range(seed + 1, seed + 1 + n_tries)
@@ -136,7 +157,7 @@ def check_state_round_trip(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int
     """Check ``get_state`` and ``set_state``: another instance continues where the first one was.
 
     Tried right after a reset, within an episode, and where ends of episodes follow. The state must
-    be a copy.
+    be a copy, of what a checkpoint can store.
 
     Example: ``check_state_round_trip(MyEnv)``
 
@@ -144,14 +165,28 @@ def check_state_round_trip(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int
     :param n_steps: steps to play, before and after
     :param seed: of play
     :raises ConformanceError: naming agent, step, and the first value that differs
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    from sb3_roles.common.env_declarations import declared
+
+    check_given(make_env, seed, n_steps=n_steps)
+    _check_state_methods(make_env())
     for cut in (0, n_steps // 7 + 1, n_steps):
         env, other = make_env(), make_env()
         *_, last = play(env, cut, seed)
-        state = env.get_state()
+        after = f"after the {last.where}"
+        state = guard(f"get_state {after}", declared(env, "get_state"))
+        try:
+            encode_tree(state, {})
+        except ValueError as error:
+            raise ConformanceError(
+                f"get_state {after}: expected what can be stored, that is numbers, texts, None, "
+                f"arrays of numbers, and lists and dicts of them with texts as keys, but {error}"
+            ) from error
         copied = frozen(state)
         reset(other, seed=seed + 1)
-        other.set_state(copied)
+        guard(f"set_state {after}", declared(other, "set_state"), frozen(copied))
         if list(other.agents) != list(env.agents):
             raise ConformanceError(
                 f"{last.where}: set_state must restore env.agents, {list(env.agents)}, "
@@ -161,38 +196,34 @@ def check_state_round_trip(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int
         plays = [go_on(one, Actions(seed + 2), n_steps, last) for one in (env, other)]
         for one, two in zip(*plays, strict=True):
             compare(one, two, why)
-        text = difference(frozen(copied), state, "state")
+        text = difference(copied, state, "state")
         if text:
             raise ConformanceError(
                 f"{last.where}: get_state must return a copy, but play has changed it: {text}"
             )
 
 
-def _notes(make_env: MakeEnv, n_steps: int, seed: int, action_seed: int) -> list[str]:
-    """Return a digest of each moment of a play."""
-    return [_digest(moment) for moment in play(make_env(), n_steps, seed, action_seed)]
+def state_methods(env: Any) -> list[str]:
+    """Return which of ``get_state`` and ``set_state`` an environment offers.
+
+    :param env: any environment
+    """
+    from sb3_roles.common.env_declarations import declared
+
+    return [name for name in ("get_state", "set_state") if callable(declared(env, name))]
 
 
-def _digest(moment: Moment) -> str:
-    digest = hashlib.sha256()
-    for text in _flat(moment.parts()):
-        digest.update(text)
-    return digest.hexdigest()[:16]
-
-
-def _flat(value: Any) -> Iterator[bytes]:
-    if isinstance(value, np.ndarray):
-        yield f"{value.dtype}{value.shape}".encode()
-        yield np.ascontiguousarray(value).tobytes()
-    elif isinstance(value, dict):
-        for key, part in value.items():
-            yield repr(key).encode()
-            yield from _flat(part)
-    elif isinstance(value, (list, tuple)):
-        for part in value:
-            yield from _flat(part)
-    else:
-        yield repr(value).encode()
+def _check_state_methods(env: Any) -> None:
+    offered, name = state_methods(env), type(env).__name__
+    if not offered:
+        raise ValueError(
+            f"make_env must make an environment with get_state and set_state, {name} has neither"
+        )
+    if len(offered) == 1:
+        raise ConformanceError(
+            f"before any step: {name} has {offered[0]} alone, expected get_state and set_state, "
+            "or neither: states are taken to be put back"
+        )
 
 
 def check_fresh_process(make_env: MakeEnv | str, n_steps: int = _N_STEPS, seed: int = 0) -> None:
@@ -206,8 +237,12 @@ def check_fresh_process(make_env: MakeEnv | str, n_steps: int = _N_STEPS, seed: 
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming the first step that differs
-    :raises ValueError: if it can not be imported elsewhere, as a lambda
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if it can not be imported, or not elsewhere, as a lambda, or a
+        number is not allowed
     """
+    made = _named(make_env) if isinstance(make_env, str) else make_env
+    check_given(made, seed, n_steps=n_steps)
     if not isinstance(make_env, str):
         module, name = make_env.__module__, getattr(make_env, "__qualname__", "<>")
         if "<" in name or module == "__main__":
@@ -215,7 +250,7 @@ def check_fresh_process(make_env: MakeEnv | str, n_steps: int = _N_STEPS, seed: 
                 f"a new process can not import {make_env!r}: give a function or class of a module"
             )
         make_env = f"{module}:{name}"
-    here = _notes(_named(make_env), n_steps, seed, seed)
+    here = digests(made, n_steps, seed, seed)
     code = "import sys; from sb3_roles.testing import seeds; seeds.print_notes(*sys.argv[1:])"
     other_hashes = "1" if os.environ.get("PYTHONHASHSEED") == "2" else "2"
     result = subprocess.run(
@@ -233,20 +268,31 @@ def check_fresh_process(make_env: MakeEnv | str, n_steps: int = _N_STEPS, seed: 
         said = (result.stderr.strip() or "no message").splitlines()[-1]
         raise ConformanceError(f"play of {make_env} in a new process failed: {said}")
     there = [line.split()[-1] for line in result.stdout.splitlines() if line.startswith("moment ")]
-    moments = play(_named(make_env)(), n_steps, seed)
+    moments = play(made(), n_steps, seed)
     for moment, one, other in zip(moments, here, there, strict=True):
         if one != other:
             raise ConformanceError(
                 f"{moment.where}, all agents: a new process with the same seed {seed} and actions "
-                "returns something else; does it depend on hash(), or on the order of a set?"
+                "returns something else, expected the same; does it depend on hash(), or on the "
+                "order of a set?"
             )
 
 
 def _named(spec: str) -> MakeEnv:
     module, _, name = spec.partition(":")
-    value: Any = import_module(module)
-    for part in name.split("."):
-        value = getattr(value, part)
+    if not module or not name:
+        raise ValueError(
+            "make_env must be a class or function, or its name as module:name, for example "
+            f"my_package.envs:MyEnv, got {spec!r}"
+        )
+    try:
+        value: Any = import_module(module)
+        for part in name.split("."):
+            value = getattr(value, part)
+    except Exception as error:
+        raise ValueError(
+            f"make_env {spec!r} can not be imported: {type(error).__name__}: {error}"
+        ) from error
     return value
 
 
@@ -257,5 +303,5 @@ def print_notes(make_env: str, n_steps: str, seed: str) -> None:
     :param n_steps: steps to play
     :param seed: of play
     """
-    for note in _notes(_named(make_env), int(n_steps), int(seed), int(seed)):
+    for note in digests(_named(make_env), int(n_steps), int(seed), int(seed)):
         print("moment", note)

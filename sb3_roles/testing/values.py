@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_roles.testing.episodes import ConformanceError, MakeEnv, Moment, play
+from sb3_roles.testing.episodes import ConformanceError, MakeEnv, Moment, check_given, play
 
 _N_STEPS = 200
 
@@ -59,7 +59,10 @@ def check_dtypes_and_shapes(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: in
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent, step, and what was expected
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
     for where, space, value, path in _observations(make_env, n_steps, seed):
         if isinstance(space, spaces.Discrete):
             whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
@@ -88,7 +91,10 @@ def check_finite(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 0) -> N
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent, step and value
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
     env = make_env()
     for moment in play(env, n_steps, seed):
         for agent, observation in moment.observation.items():
@@ -122,7 +128,10 @@ def check_spaces(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 0) -> N
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent, step, and the value that is out of bounds
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
     env = make_env()
     for agent in getattr(env, "possible_agents", ()):
         for name in ("observation_space", "action_space"):
@@ -159,9 +168,12 @@ def check_infos(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 0) -> No
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent, step, and what is missing or shared
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
     from sb3_roles.common.env_declarations import declared_names
 
+    check_given(make_env, seed, n_steps=n_steps)
     env = make_env()
     declared = {
         "reward_components": declared_names(env, "reward_component_names"),
@@ -210,7 +222,10 @@ def check_agents(make_env: MakeEnv, n_steps: int = _N_STEPS, seed: int = 0) -> N
     :param n_steps: steps to play
     :param seed: of play
     :raises ConformanceError: naming agent and step
+    :raises TypeError: if ``make_env`` can not be called
+    :raises ValueError: if another argument is not allowed
     """
+    check_given(make_env, seed, n_steps=n_steps)
     env = make_env()
     possible = list(getattr(env, "possible_agents", ()))
     if not possible:

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
 from sb3_roles._version import __version__
+from sb3_roles.common.env_failures import EnvironmentFailed
+from sb3_roles.common.interrupts import interrupt_once
 from sb3_roles.zoo.options import Parser, UsageError
 
 COMMANDS = (
@@ -30,7 +33,7 @@ COMMANDS = (
     "sb3_roles.zoo.bench",
     "sb3_roles.prove.command",
 )
-EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 130, 141
+EXIT_FAILED, EXIT_INTERRUPTED, EXIT_CLOSED_PIPE = 3, 130, 141
 
 
 def make_parser(script: str | None = None) -> Parser:
@@ -56,10 +59,21 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
 
     :param argv: arguments without the name of the program, ``sys.argv[1:]`` by default
     :param script: the command, where it is not the first argument: ``"train"`` for ``train.py``
-    :return: the exit code: 0, 2 after a usage error, 130 after Ctrl-C, 141 after a closed pipe, or
-        the command's own
+    :return: the exit code: 0, 2 after a usage error, 3 after an error of an environment, 130 after
+        Ctrl-C, 141 after a closed pipe, or the command's own
     :raises SystemExit: after help, ``--version`` and a wrong command line
     """
+    if argv is not None:
+        return _main(argv, script)
+    interrupt_once()
+    try:
+        return _main(sys.argv[1:], script)
+    finally:
+        # The process ends; a Ctrl-C now would have the interpreter print a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _main(arguments: Sequence[str], script: str | None) -> int:
     if hasattr(sys.stdout, "reconfigure"):
         # A terminal that can not show "±" gets "?", not a traceback.
         sys.stdout.reconfigure(errors="replace")
@@ -67,10 +81,9 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
         parser = make_parser(script)
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = [*arguments] if script is None else [script, *arguments]
     try:
         try:
-            arguments = arguments if script is None else [script, *arguments]
             args = parser.parse_args(arguments)
             args.arguments, parser = arguments, args.parser
             code = args.run(args)
@@ -84,6 +97,9 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
         return EXIT_CLOSED_PIPE
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    except EnvironmentFailed as error:
+        print(f"{parser.prog}: error: {error}", file=sys.stderr)
+        return EXIT_FAILED
     except UsageError as error:
         parser.error(str(error))
     except MemoryError as error:

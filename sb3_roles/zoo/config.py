@@ -6,8 +6,10 @@ The layout is rl-zoo's: an environment's name (or ``default``) at the top, then 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
+from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,7 @@ _CONFIGS = (
 )
 # PyYAML reads as much in some tenths of a second; the files of this package have up to 12 KB.
 _MAX_BYTES = 1 << 16
+_MOST_RUNS = 5
 
 
 class ConfigError(UsageError):
@@ -227,14 +230,28 @@ def resolve(
     return config
 
 
+def _no_run(folder: Path) -> str:
+    """Say that a folder is none of a run, and which runs there are in it, or beside it."""
+    where = folder if folder.is_dir() else folder.parent
+    what = "no run folder, without config.yml" if folder.is_dir() else "no such run folder"
+    found = [path.parent for depth in ("*", "*/*") for path in where.glob(f"{depth}/{CONFIG_FILE}")]
+    names = sorted(str(path.relative_to(where)) for path in found)
+    if not names:
+        return f"{folder}: {what}"
+    close = get_close_matches(folder.name, names, n=1)
+    hint = f"; did you mean {str(where / close[0])!r}?" if close else ""
+    more = f" and {len(names) - _MOST_RUNS} more" if len(names) > _MOST_RUNS else ""
+    return f"{folder}: {what}; runs in {where}: {', '.join(names[:_MOST_RUNS])}{more}{hint}"
+
+
 def read_run_config(run: Path) -> dict[str, Any]:
     """Read and check the configuration of a run folder.
 
     :param run: the folder
     :raises ConfigError: if it is none, or its configuration is wrong
     """
-    if not run.is_dir():
-        raise ConfigError([f"{run}: no such run folder"])
+    if not run.is_dir() or not os.path.lexists(run / CONFIG_FILE):
+        raise ConfigError([_no_run(run)])
     content = _read_mapping(run / CONFIG_FILE)
     settings = _without_identity(content)
     try:

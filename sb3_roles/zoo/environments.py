@@ -14,6 +14,7 @@ from typing import Any
 from area_search.scenes import SCENES, Scene, SceneError, get_scenes
 from sb3_roles.common.names import closest, shown
 from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.stop_signals import SecondSignal
 
 AREA_SEARCH = "area-search-v0"
 ENVIRONMENTS: dict[str, str] = {AREA_SEARCH: "area_search:AreaSearchEnv"}
@@ -120,7 +121,9 @@ def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:
         sys.path.insert(0, os.getcwd())
     try:
         factory = getattr(import_module(module), name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if isinstance(error, SecondSignal):
+            raise
         raise UsageError(f"--env {env}: {type(error).__name__}: {error}") from error
 
     def make() -> Any:
@@ -128,7 +131,9 @@ def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:
 
     try:
         made = make()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if isinstance(error, SecondSignal):
+            raise
         given = ", ".join(f"{key}={value!r}" for key, value in env_kwargs.items())
         raise UsageError(f"--env {env}: {name}({given}) fails: {error}") from error
     if not isinstance(made, ParallelEnv):

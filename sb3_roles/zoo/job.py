@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -21,6 +23,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
+from sb3_roles.common.env_failures import EnvironmentFailed
 from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
@@ -36,12 +39,13 @@ from sb3_roles.evaluation.evaluators import (
 )
 from sb3_roles.zoo.algorithms import get_algorithm
 from sb3_roles.zoo.config import CONFIG_FILE, write_yaml
-from sb3_roles.zoo.environments import AREA_SEARCH, folder_name, scenes_of_run
+from sb3_roles.zoo.environments import AREA_SEARCH, ENVIRONMENTS, folder_name, scenes_of_run
 from sb3_roles.zoo.launcher import process_settings
-from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model
+from sb3_roles.zoo.models import check_device, check_run, complete, make_env, make_model, told
 from sb3_roles.zoo.options import UsageError
 from sb3_roles.zoo.ray_options import rollouts_on_ray
-from sb3_roles.zoo.resumption import has_checkpoint, note_inexact, read_newest
+from sb3_roles.zoo.resumption import has_checkpoint, note_anew, note_inexact, read_newest
+from sb3_roles.zoo.run_facts import PROGRESS
 from sb3_roles.zoo.run_folder import (
     BEST,
     CHECKPOINTS,
@@ -92,8 +96,10 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
         model = make_model(config, env, options["device"])
         if get_algorithm(config["algo"]).clones:
             _ask(config, model.check_data)  # type: ignore[attr-defined]
-        if options.get("strict_resume") and goes_on:
-            # Before anything in the folder is touched, even its lock.
+        # Before anything in the folder is touched, even its lock.
+        if options.get("strict_resume") and not goes_on:
+            note_anew(job)
+        elif options.get("strict_resume"):
             folder = CheckpointFolder(Path(job["resume"]) / CHECKPOINTS)
             note_inexact(read_newest(folder, model, complete(config))[2], job)
         # Ray has a handler of its own.
@@ -104,12 +110,22 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
                 stop.check()
                 return _train_in(run, model, job, stop)
             except KeyboardInterrupt:
-                print(f"stopped; to go on: train.py --resume {run}", flush=True)
+                print(f"stopped; to go on: {_resuming(run, config)}", flush=True)
                 return stop.exit_code
+            except EnvironmentFailed as error:
+                if options["verbose"] > 1:
+                    traceback.print_exception(error)
+                raise TrainingFailed(f"{run}: {error}") from error
             finally:
                 lock.release()
     finally:
         env.close()
+
+
+def _resuming(run: Path, config: Mapping[str, Any]) -> str:
+    """Return the command that goes on with a run; code that it is to call has to be named."""
+    own = [] if config["env"] in ENVIRONMENTS else ["--env", config["env"]]
+    return shlex.join(["train.py", "--resume", str(run), *own])
 
 
 def _ask(config: Mapping[str, Any], question: Callable[[], object]) -> None:
@@ -171,17 +187,19 @@ def _train_in(
     for folder in (run, run / BEST):
         remove_partial(folder)
     resume, begun = None, 0
+    reasons: list[str] = []
     if job["resume"] is not None and not has_checkpoint(run):
-        print(f"{run} has no checkpoint yet: it begins anew", flush=True)
+        note_anew(job)
     elif job["resume"] is not None:
-        resume, begun, reasons = read_newest(checkpoints, model, config)
+        again = bool(options.get("strict_resume"))
+        resume, begun, reasons = read_newest(checkpoints, model, config, again)
         note_inexact(reasons, job)
         if options.get("n_timesteps", begun) < begun:
             wanted = options["n_timesteps"]
             raise UsageError(f"{run} has {begun} joint steps already, more than -n {wanted}")
 
     with ExitStack() as stack:
-        log = CsvLog(run / "progress.csv")
+        log = CsvLog(run / PROGRESS)
         logger = _logger(run, log, config, options)
         stack.callback(logger.close)
         model.set_logger(logger)
@@ -212,8 +230,9 @@ def _train_in(
                 begin=begin,
             )
         except CheckpointError as error:
-            raise UsageError(f"{run}: {error}") from error
-        except UsageError:
+            since = f" (since then: {'; '.join(reasons)})" if reasons else ""
+            raise UsageError(told(run, error) + since) from error
+        except (UsageError, EnvironmentFailed):
             raise
         except NotFiniteError as error:
             message = f"{run}: {_kept(run, model, error)}"
@@ -235,6 +254,8 @@ def _train_in(
             raise MemoryError(one_line(error)) from error
     print(f"{run}: {steps} joint steps; checkpoints: {len(checkpoints.paths())}", flush=True)
     stop.check()
+    if options["verbose"]:
+        print(f"evaluating {options['eval_episodes']} held-out episodes", flush=True)
     _evaluate(run, model, config, options["eval_episodes"])
     # Of a signal that came while the scores were written: no other run shall begin.
     stop.check()

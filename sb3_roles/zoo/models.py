@@ -142,15 +142,29 @@ def check_run(config: Mapping[str, Any], env: VecEnv, folder: Path) -> None:
     :param folder: of the run
     :raises UsageError: saying why the newest one does not fit, if none does
     """
-    reason = None
     outline = policy_outline(small_config(config, 1), env)
-    for path in reversed(CheckpointFolder(folder / CHECKPOINTS).paths()):
-        try:
-            check_policy(outline, read_outline(path))
-            return
-        except CheckpointError as error:
-            reason = reason or error
-    raise UsageError(f"{folder}: {reason or 'no checkpoint'}")
+    checkpoints = CheckpointFolder(folder / CHECKPOINTS)
+    if not checkpoints.paths():
+        raise UsageError(
+            f"{folder}: no checkpoint is left of what was trained: put {CHECKPOINTS}/ back, or "
+            "begin a new run"
+        )
+    try:
+        with warnings.catch_warnings():
+            # Said when it is read.
+            warnings.simplefilter("ignore")
+            checkpoints.first(lambda path: check_policy(outline, read_outline(path)))
+    except CheckpointError as error:
+        raise UsageError(told(folder, error)) from error
+
+
+def told(folder: Path, error: CheckpointError) -> str:
+    """Return what is wrong with a file of a run, which the error may name already.
+
+    :param folder: of the run
+    :param error: what was found
+    """
+    return str(error) if str(error).startswith(f"{folder}") else f"{folder}: {error}"
 
 
 def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
@@ -269,6 +283,6 @@ def load_model(
             load_weights(model, checkpoint)
         model.num_timesteps = steps_of(checkpoint, "agent_steps")
     except CheckpointError as error:
-        raise UsageError(f"{folder}: {error}") from error
+        raise UsageError(told(folder, error)) from error
     model.policy.set_training_mode(False)
     return model

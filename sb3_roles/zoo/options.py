@@ -156,10 +156,21 @@ def output_file(*endings: str) -> Callable[[str], Path]:
         if file.is_dir():
             raise argparse.ArgumentTypeError(f"{shown(text)} is a folder, name a file")
         if not file.parent.is_dir():
-            raise argparse.ArgumentTypeError(f"folder {str(file.parent)!r} does not exist")
+            said = "is no folder" if file.parent.exists() else "does not exist"
+            raise argparse.ArgumentTypeError(f"folder {str(file.parent)!r} {said}")
+        # The file takes the place of an earlier one, which needs the rights of the folder.
+        if not os.access(file.parent, os.W_OK):
+            raise argparse.ArgumentTypeError(f"folder {str(file.parent)!r} can not be written")
         return file
 
     return path
+
+
+def folder_name(text: str) -> str:
+    """Read the name of a folder: no name is not the current one."""
+    if not text:
+        raise argparse.ArgumentTypeError("must name a folder, got ''")
+    return text
 
 
 def check_folder(option: str, folder: Path) -> None:
@@ -218,9 +229,7 @@ def key_value(text: str) -> tuple[str, Any]:
     """
     key, colon, value = text.partition(":")
     if not (colon and value and key.isidentifier()):
-        raise argparse.ArgumentTypeError(
-            f"must be key:value, such as horizon:100, got {shown(text)}"
-        )
+        raise argparse.ArgumentTypeError(f"must be key:value, got {shown(text)}")
     try:
         return key, parse_value(value)
     except ValueError as error:

@@ -16,27 +16,50 @@ from sb3_roles.common.env_state import env_gap
 from sb3_roles.common.facts import differences, machine_facts
 from sb3_roles.zoo.config import plain
 from sb3_roles.zoo.environments import ENVIRONMENTS
-from sb3_roles.zoo.models import steps_of
+from sb3_roles.zoo.models import steps_of, told
 from sb3_roles.zoo.options import UsageError
+from sb3_roles.zoo.run_facts import PROGRESS
 from sb3_roles.zoo.run_folder import CHECKPOINTS, SCORES_FILE
 
 
 def has_checkpoint(run: Path) -> bool:
-    """Return whether a run has one, or had: what was evaluated had, and has lost it.
+    """Return whether a run has one, or has lost it: who resumes it is not to begin anew then.
+
+    What was evaluated at the end had one. The folder of checkpoints is made before anything is
+    logged: where there is a log and no such folder, somebody has removed it, with what was in it.
 
     :param run: the run folder
     """
-    return bool(CheckpointFolder(run / CHECKPOINTS).paths()) or (run / SCORES_FILE).exists()
+    checkpoints = CheckpointFolder(run / CHECKPOINTS)
+    lost = (run / PROGRESS).exists() and not checkpoints.folder.exists()
+    return bool(checkpoints.paths()) or lost or (run / SCORES_FILE).exists()
+
+
+def note_anew(job: Mapping[str, Any]) -> None:
+    """Say, or refuse, that a run which was killed before its first checkpoint begins anew.
+
+    :param job: see ``job.run_job``
+    :raises UsageError: with ``--strict-resume``
+    """
+    run = Path(job["resume"])
+    if job["options"].get("strict_resume"):
+        raise UsageError(f"--strict-resume: {run} has no checkpoint to go on from")
+    dropped = f"; the rows of {PROGRESS} are dropped" if (run / PROGRESS).exists() else ""
+    print(f"{run} has no checkpoint yet: it begins anew{dropped}", flush=True)
 
 
 def read_newest(
-    checkpoints: CheckpointFolder, model: OnPolicyAlgorithm, config: Mapping[str, Any]
+    checkpoints: CheckpointFolder,
+    model: OnPolicyAlgorithm,
+    config: Mapping[str, Any],
+    again: bool = False,
 ) -> tuple[Checkpoint, int, list[str]]:
     """Read where a run was; nothing is written.
 
     :param checkpoints: of the run
     :param model: made of its configuration, with its environment
     :param config: complete
+    :param again: it has been read before, and what there was to warn of is known
     :return: the checkpoint, its joint steps, and what may keep it from going on bit for bit
     :raises UsageError: if there is none, or none that is sound and fits
     """
@@ -49,8 +72,8 @@ def read_newest(
             _, checkpoint = checkpoints.newest(check)
         begun = steps_of(checkpoint, "env_steps")
     except CheckpointError as error:
-        raise UsageError(str(error)) from error
-    for warning in caught:
+        raise UsageError(told(checkpoints.folder.parent, error)) from error
+    for warning in caught[: 0 if again else None]:
         print(f"warning: {warning.message}", flush=True)
     assert model.env is not None
     machine, trained = (checkpoint.manifest.get(name) for name in ("machine", "config"))

@@ -10,12 +10,14 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 
 from sb3_roles.common.files import is_writing
+from sb3_roles.common.interrupts import SAME_STOP
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STDERR = 2
-# Seconds within which a second signal is the first one's: timeout, srun and some terminals signal a
-# process and its group.
-_SAME_STOP = 0.3
+
+
+class SecondSignal(SystemExit):
+    """The end of the program: no exit that an environment of anybody's own has asked for."""
 
 
 class StopSignals:
@@ -89,9 +91,9 @@ class StopSignals:
     def _note(self, number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
         if self.received is not None:
-            if now - self._when < _SAME_STOP:
+            if now - self._when < SAME_STOP:
                 return
-            raise SystemExit(128 + number)
+            raise SecondSignal(128 + number)
         self.received, self._when = number, now
         message = self._at_once or self.message
         if message:

@@ -12,12 +12,14 @@ from sb3_roles.common.names import shown
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.config import ConfigError
 from sb3_roles.zoo.config_checks import VEC_ENVS
+from sb3_roles.zoo.environments import ENVIRONMENTS
 from sb3_roles.zoo.launcher import prepare_process
 from sb3_roles.zoo.options import (
     DEVICES,
     MAX_TRAINING_SEED,
     KeyValues,
     check_folder,
+    folder_name,
     int_text,
     key_value,
     one_of,
@@ -26,6 +28,7 @@ from sb3_roles.zoo.options import (
     whole_number,
 )
 from sb3_roles.zoo.ray_options import add_ray_options, check_ray_options, connected_to
+from sb3_roles.zoo.run_folder import BEST, CHECKPOINTS
 from sb3_roles.zoo.stop_signals import StopSignals
 from sb3_roles.zoo.train_jobs import DEFAULTS, GIVEN, RunName, new_jobs, resumed_job
 
@@ -101,7 +104,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "one after the other, or with --ray side by side")  # fmt: skip
     add("--vec-env", type=one_of("backend", VEC_ENVS), metavar="NAME", help="native, supersuit or "
         "auto")  # fmt: skip
-    add("-f", "--log-folder", metavar="DIR", help="folder of the runs")
+    add("-f", "--log-folder", type=folder_name, metavar="DIR", help="folder of the runs")
     add("--eval-freq", type=whole_number(0, 10**12), metavar="N", help="joint steps between "
         "evaluations, 0 for none")  # fmt: skip
     add("--eval-episodes", type=whole_number(1, 10**6), metavar="N", help="team episodes of an "
@@ -110,15 +113,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "checkpoints, 0 for one at the end")  # fmt: skip
     add("--log-interval", type=whole_number(1, 10**6), metavar="N", help="iterations between rows "
         "of the log")  # fmt: skip
-    add("-tb", "--tensorboard-log", metavar="DIR", help="folder for TensorBoard")
+    add("-tb", "--tensorboard-log", type=folder_name, metavar="DIR", help="folder for TensorBoard")
     add("--device", type=one_of("device", DEVICES), metavar="NAME", help="cpu, "
         "cuda or auto")  # fmt: skip
     add("--num-threads", type=whole_number(1, 1024), metavar="T", help="threads of torch; by "
         "default torch's own choice")  # fmt: skip
     add_ray_options(add)
     add("-P", "--progress", action="store_true", help="show a progress bar")
-    add("--resume", type=Path, metavar="RUN", help="run folder to continue bit for bit; needs "
-        "--env, too, if that is module:factory")  # fmt: skip
+    add("--resume", type=folder_name, metavar="RUN", help="run folder to continue bit for bit; "
+        "needs --env, too, if that is module:factory")  # fmt: skip
     add("--strict-resume", action="store_true", help="with --resume: go on only if nothing "
         "is known that keeps it from being bit for bit, such as other threads, versions or kinds "
         "of processors; else exit with code 2, and leave the run as it is")  # fmt: skip
@@ -141,8 +144,8 @@ def run(args: argparse.Namespace) -> int:
     """Train, once for each algorithm, change and seed.
 
     :param args: parsed arguments
-    :return: 0; 2 if the configuration is wrong; 3 if a loss or reward is not finite; 130 or 143
-        after a signal
+    :return: 0; 2 if the configuration is wrong; 3 if a loss or reward is not finite, or the
+        environment fails; 130 or 143 after a signal
     :raises UsageError: if the arguments do not go together
     """
     stop = StopSignals()
@@ -164,7 +167,7 @@ def _run(args: argparse.Namespace, stop: StopSignals) -> int:
             runs, jobs = new_jobs(given)
         for job in jobs:
             check_ray_options(job["options"], job["config"], len(jobs) > 1)
-        _check_folders(jobs[0]["options"])
+        _check_folders(jobs[0]["options"], jobs[0]["resume"])
     except ConfigError as error:
         for line in error.lines:
             print(f"{args.parser.prog}: error: {line}", file=sys.stderr)
@@ -186,10 +189,12 @@ def _run(args: argparse.Namespace, stop: StopSignals) -> int:
     return 0
 
 
-def _check_folders(options: Mapping[str, Any]) -> None:
+def _check_folders(options: Mapping[str, Any], run: Path | None) -> None:
     for name in ("log_folder", "tensorboard_log"):
         if options[name] is not None:
             check_folder(f"--{name.replace('_', '-')}", Path(options[name]))
+    for path in () if run is None else (run, run / CHECKPOINTS, run / BEST):
+        check_folder("--resume", path)
 
 
 def _fan_out(
@@ -208,7 +213,8 @@ def _fan_out(
         with stop.caught():
             return run_on_ray(args.arguments, [RunOf(*run) for run in runs], options, n_threads)
     except KeyboardInterrupt:
-        print("stopped; each run goes on with: train.py --resume RUN", flush=True)
+        own = "" if options["env"] in ENVIRONMENTS else f" --env {options['env']}"
+        print(f"stopped; each run goes on with: train.py --resume RUN{own}", flush=True)
         return stop.exit_code
     finally:
         cluster.disconnect()
