@@ -106,7 +106,8 @@ def _plan_in_turn(
                 continue
             for j in range(n_agents):
                 _release(j, rules.disc, routes, marks)
-            for j in range(n_agents):
+            for k in range(n_agents):
+                j = (first + k) % n_agents
                 if j != i:
                     _claim(cells, j, rules, routes, marks)
         routes.robbed[i] = False

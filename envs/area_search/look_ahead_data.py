@@ -20,7 +20,7 @@ from area_search.cells import (
 )
 from area_search.scenes import Scene
 
-DEPTH = 10
+DEPTH = 14
 """Steps that a route looks ahead; farther only to what is worth something at all."""
 STEPS_LEFT = (0, 25, 50)
 """Steps left of an episode at which the two below are known; linear in between."""
@@ -29,13 +29,16 @@ DISCOUNTS = (0.84, 0.80, 0.67)
 CURIOSITY = (0.5, 1.05, 1.1)
 """What a target that is only expected counts, against a known one.
 
-Towards the end it may be too late to cover what is found. These and ``DENSITY_POWER`` were searched
-for by an evolution strategy, on episodes of seeds that no evaluation plays.
+Towards the end it may be too late to cover what is found. These were searched for by an evolution
+strategy, on episodes of seeds that no evaluation plays.
 """
-DENSITY_POWER = 0.4
-"""How much more unseen cells are worth where targets are frequent, see :func:`make_timetable`."""
-DENSITY = 100 / 375
-"""Targets per free cell in the paper's training scene, where the above is exact."""
+LOAD = 100 / 375 / 4
+"""Targets per free cell and robot in the paper's training scene, where the above is exact."""
+LOAD_POWER = 0.6
+"""How much more a target that is expected counts where a robot has fewer of them to cover.
+
+A team with time to spare has less to do but to look for more.
+"""
 CHANCES = (0.82, 0.55, 0.1, 0.02, 0.0)
 """Chance that an unseen cell near the team is free, by the known obstacles among its 4 neighbors.
 
@@ -47,8 +50,8 @@ FIRM = 5
 """A robot plans again if a team mate is to get what it would have got within this many steps."""
 ROUNDS = 2
 """Times that a robot plans at most, for the team to agree."""
-ORDERS = 2
-"""Plans of a team, each begun by another robot, of which the best is taken."""
+ORDERS = 8
+"""Plans of a team at most, each begun by another robot, of which the best is taken."""
 
 _WORTH_BITS, _DISCOUNT_BITS = 10, 20
 TARGET_WORTH = 1 << _WORTH_BITS
@@ -177,20 +180,20 @@ def discount_at(left: float) -> float:
     return float(np.interp(left, STEPS_LEFT, DISCOUNTS))
 
 
-def unseen_worths(density: float, left: float) -> np.ndarray:
+def unseen_worths(density: float, n_agents: int, left: float) -> np.ndarray:
     """Return what an unseen cell is worth, in targets, by the known obstacles beside it.
 
-    It is the number of targets to be expected on it, times ``CURIOSITY``; in scenes of another
-    density than ``DENSITY`` it changes with a power of it: where there are few targets, there is
-    less to do but to look for them.
+    It is the number of targets to be expected on it, times ``CURIOSITY``, and more where a robot
+    has fewer targets to cover than ``LOAD``.
 
     :param density: targets per free cell
+    :param n_agents: robots in the team
     :param left: steps left of the episode
     :return: float64 (5,)
     """
     curiosity = np.interp(left, STEPS_LEFT, CURIOSITY)
-    expected = DENSITY * (density / DENSITY) ** DENSITY_POWER
-    return np.asarray(np.array(CHANCES) * expected * curiosity)
+    spare = (LOAD * n_agents / density) ** LOAD_POWER
+    return np.asarray(np.array(CHANCES) * density * spare * curiosity)
 
 
 def make_timetable(scene: Scene, stride: int) -> Timetable:
@@ -209,7 +212,7 @@ def make_timetable(scene: Scene, stride: int) -> Timetable:
     # A goal however far is worth something.
     discounts = np.maximum(1, np.round(powers * (1 << _DISCOUNT_BITS))).astype(np.int64)
     density = scene.n_targets / scene.n_free
-    unseen = np.stack([unseen_worths(density, n) for n in left])
+    unseen = np.stack([unseen_worths(density, scene.n_agents, n) for n in left])
     worths = np.maximum(1, np.round(unseen * TARGET_WORTH)).astype(np.int64)
     rules = Rules(
         MOVE_ROWS * stride + MOVE_COLUMNS,

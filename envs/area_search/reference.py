@@ -305,7 +305,9 @@ class ReferenceAreaSearch:
             unexplored = set(self.all_cells) - self.explored
             density = self.scene.n_targets / self.scene.n_free
             left = max(1, self.scene.horizon - self.n_steps)
-            team_map = TeamMap(ground, known, unexplored, self.disc, density, left)
+            team_map = TeamMap(
+                ground, known, unexplored, self.disc, density, len(self.robots), left
+            )
             out[:, 2] = route_features(team_map, self.robots)
         for k, goals in enumerate((frontier, known)):
             if self.sub_goal == "nearest":

@@ -44,6 +44,7 @@ class TeamMap:
     :param unexplored: cells of the map that nobody has seen
     :param disc: the cells of the map that a robot senses from a cell
     :param density: expected targets per free cell
+    :param n_agents: robots in the team
     :param left: steps left of the episode
     """
 
@@ -52,6 +53,7 @@ class TeamMap:
     unexplored: set[Cell]
     disc: Callable[[Cell], set[Cell]]
     density: float
+    n_agents: int
     left: int
     known_gains: dict[tuple[Cell, Cell], dict[Cell, int]] = field(default_factory=dict)
 
@@ -59,7 +61,7 @@ class TeamMap:
         """Return the worth of an unseen cell; off the map all is known to be obstacles."""
         beside = [(cell[0] + dr, cell[1] + dc) for dr, dc in MOVES[1:]]
         obstacles = sum(c not in self.ground and c not in self.unexplored for c in beside)
-        worth = constants.unseen_worths(self.density, self.left)[obstacles] * _UNIT
+        worth = constants.unseen_worths(self.density, self.n_agents, self.left)[obstacles] * _UNIT
         return max(1, round(float(worth)))
 
     def gains(self, before: Cell, cell: Cell) -> dict[Cell, int]:
@@ -136,7 +138,7 @@ class TeamRoutes:
                 if turn > 0 and i not in self.robbed:
                     continue
                 claims: dict[Cell, tuple[int, int]] = {}
-                for j in range(len(robots)):
+                for j in order:
                     if j != i and self.found[j]:
                         self.claim(j, claims)
                 self.robbed.discard(i)
