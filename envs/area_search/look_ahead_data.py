@@ -50,7 +50,7 @@ FIRM = 5
 """A robot plans again if a team mate is to get what it would have got within this many steps."""
 ROUNDS = 2
 """Times that a robot plans at most, for the team to agree."""
-ORDERS = 8
+ORDERS = 4
 """Plans of a team at most, each begun by another robot, of which the best is taken."""
 
 _WORTH_BITS, _DISCOUNT_BITS = 10, 20
