@@ -143,11 +143,10 @@ def plan_routes(
         starts[i] = (position[i, 0] + border) * cells.shape[1] + position[i, 1] + border
     rules = rules_at(timetable, timetable.rules.left - steps)
     flat = cells.reshape(-1)
-    n_orders = min(rules.orders, starts.shape[0])
     best_total, best = -1, 0
-    for order in range(n_orders):
+    for order in range(rules.orders):
         # The plan that is begun by the first robot comes last: often it needs no other.
-        first = n_orders - 1 - order
+        first = rules.orders - 1 - order
         total = _plan_in_turn(first, flat, rules, marks, labels, routes)
         if total >= best_total:
             best_total, best = total, first

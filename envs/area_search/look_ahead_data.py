@@ -52,6 +52,8 @@ ROUNDS = 2
 """Times that a robot plans at most, for the team to agree."""
 ORDERS = 4
 """Plans of a team at most, each begun by another robot, of which the best is taken."""
+ROUTES = 32
+"""Routes in all these plans, at most: more plans cost large teams most, and gain them least."""
 
 _WORTH_BITS, _DISCOUNT_BITS = 10, 20
 TARGET_WORTH = 1 << _WORTH_BITS
@@ -67,8 +69,8 @@ class Rules(NamedTuple):
     see :func:`~area_search.cells.edge_offsets`; ``discounts`` int64 (n,), by steps, the last one
     for all that are later, all above 0; ``worths`` int64 (5,), of an unseen cell by the number of
     known obstacles beside it; ``target``, that of a known target; ``left``, the longest that a
-    route may be; ``depth``, ``slack``, ``firm``, ``rounds`` and ``orders`` are the constants of
-    these names, the slack as a worth.
+    route may be; ``depth``, ``slack``, ``firm`` and ``rounds`` are the constants of these names, the
+    slack as a worth; ``orders``, see :func:`n_orders`.
     """
 
     offsets: np.ndarray
@@ -196,6 +198,14 @@ def unseen_worths(density: float, n_agents: int, left: float) -> np.ndarray:
     return np.asarray(np.array(CHANCES) * density * spare * curiosity)
 
 
+def n_orders(n_agents: int) -> int:
+    """Return how many plans a team makes, see ``ORDERS`` and ``ROUTES``.
+
+    :param n_agents: robots in the team
+    """
+    return max(1, min(ORDERS, n_agents, ROUTES // n_agents))
+
+
 def make_timetable(scene: Scene, stride: int) -> Timetable:
     """Return the rules of a scene.
 
@@ -227,7 +237,7 @@ def make_timetable(scene: Scene, stride: int) -> Timetable:
         int(SLACK * TARGET_WORTH),
         FIRM,
         ROUNDS,
-        ORDERS,
+        n_orders(scene.n_agents),
     )
     return Timetable(rules, discounts, worths)
 

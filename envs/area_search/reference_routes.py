@@ -178,8 +178,8 @@ def route_features(known: TeamMap, robots: list[Cell]) -> np.ndarray:
     :return: float32 (n_agents, 11)
     """
     out = np.zeros((len(robots), 11), np.float32)
-    n_orders = min(constants.ORDERS, len(robots))
-    plans = [TeamRoutes(known, robots, begin) for begin in range(n_orders)]
+    begins = range(constants.n_orders(len(robots)))
+    plans = [TeamRoutes(known, robots, begin) for begin in begins]
     for i, (top, *others) in enumerate(max(plans, key=TeamRoutes.total).found):
         if top.value == 0:
             continue
