@@ -69,8 +69,8 @@ class Rules(NamedTuple):
     see :func:`~area_search.cells.edge_offsets`; ``discounts`` int64 (n,), by steps, the last one
     for all that are later, all above 0; ``worths`` int64 (5,), of an unseen cell by the number of
     known obstacles beside it; ``target``, that of a known target; ``left``, the longest that a
-    route may be; ``depth``, ``slack``, ``firm`` and ``rounds`` are the constants of these names, the
-    slack as a worth; ``orders``, see :func:`n_orders`.
+    route may be; ``depth``, ``slack``, ``firm`` and ``rounds`` are the constants of these names,
+    the slack as a worth; ``orders``, see :func:`n_orders`.
     """
 
     offsets: np.ndarray
