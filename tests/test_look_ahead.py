@@ -9,7 +9,7 @@ import pytest
 from helpers import DOWN, LEFT, RIGHT, STOP, UP, hand_made
 
 from area_search import BatchedAreaSearch, Scene
-from area_search.look_ahead_data import CHANCES, DEPTH, discount_at, unseen_worths
+from area_search.look_ahead_data import CHANCES, DEPTH, discount_at, n_orders, unseen_worths
 from sb3_roles.baselines import controller_class
 from sb3_roles.evaluation.episodes import run_episodes
 
@@ -112,6 +112,21 @@ def test_unseen_cells_are_worth_the_targets_to_be_expected():
     # Worths are rounded to 1 / 1024 of a target.
     expected = unseen_worths(density, 1, batch.scene.horizon)[2] * late(2, 3)
     assert got[6 + RIGHT] == pytest.approx(expected, abs=late(2, 3) / 2048 + 1e-5)
+
+
+def test_what_is_expected_counts_more_where_robots_have_less_to_do():
+    # The paper's training scene: 100 targets on 375 free cells for 4 robots.
+    late, early = (unseen_worths(100 / 375, 4, left) for left in (50, 0))
+    assert late == pytest.approx(np.array(CHANCES) * 100 / 375 * 1.1)
+    assert early == pytest.approx(np.array(CHANCES) * 100 / 375 * 0.5)
+    twice = unseen_worths(100 / 375, 8, 50)
+    assert twice == pytest.approx(late * 2**0.6)
+    assert unseen_worths(50 / 375, 4, 50) == pytest.approx(twice / 2)
+    assert unseen_worths(100 / 375, 1000, 50).max() == 1.0
+
+
+def test_large_teams_make_fewer_plans():
+    assert [n_orders(n) for n in (1, 3, 4, 8, 9, 11, 16, 17, 50)] == [1, 3, 4, 4, 3, 2, 2, 1, 1]
 
 
 def test_the_rows_of_the_goal_sets_are_those_of_assigned():

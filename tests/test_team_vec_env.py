@@ -606,6 +606,20 @@ def test_so_is_one_outside_of_its_steps(monkeypatch, name):
         use.get(name, lambda: make_team_vec_env(PlainEnv, 1, 0))()
 
 
+def test_all_environments_are_closed_whichever_fails(monkeypatch):
+    closed = []
+
+    def fail(env):
+        closed.append(env)
+        raise RuntimeError("simulator is gone")
+
+    vec_env = make_team_vec_env(PlainEnv, 3, 0)
+    monkeypatch.setattr(PlainEnv, "close", fail)
+    with pytest.raises(EnvironmentFailed, match="RuntimeError in close: simulator is gone"):
+        vec_env.close()
+    assert len(closed) == 3
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SecondSignal(143), MemoryError])
 def test_stops_and_a_lack_of_memory_pass_through_an_environment(monkeypatch, error):
     def fail(env, actions):

@@ -492,6 +492,25 @@ def test_an_error_of_an_environment_is_one_line_and_one_exit_code(
     assert message.count("\n") == 1
 
 
+def test_an_environment_that_can_not_be_closed_is_a_warning(tmp_path, monkeypatch, capsys):
+    def fail(env):
+        raise RuntimeError("simulator is gone")
+
+    def step(env, actions):
+        raise KeyError("x")
+
+    monkeypatch.setattr(toy_envs.PlainEnv, "close", fail)
+    env = ["--env", "toy_envs:PlainEnv", "--algo", "mappo", "-f", str(tmp_path), "-n", "32"]
+    begin = "warning: environment toy_envs:PlainEnv: RuntimeError in close: simulator is gone ("
+    assert main([*env, *SMALL, *FAST], "train") == 0
+    assert all(line.startswith(begin) for line in capsys.readouterr().err.splitlines())
+    monkeypatch.setattr(toy_envs.PlainEnv, "step", step)
+    assert main([*env, *SMALL, *FAST], "train") == 3
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith(begin)
+    assert "KeyError in step 1: 'x'" in second
+
+
 def test_the_command_that_goes_on_names_the_environment(tmp_path, monkeypatch, capsys):
     def interrupted(*args):
         raise KeyboardInterrupt

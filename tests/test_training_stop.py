@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_roles.common import files
+from sb3_roles.common import files, interrupts
 from sb3_roles.common.checkpoint import CheckpointFolder
 from sb3_roles.evaluation.callback import EvaluationCallback
 from sb3_roles.gnn import recording
@@ -18,7 +18,7 @@ from sb3_roles.gnn.gnn import GNN
 from sb3_roles.prove import processes
 from sb3_roles.prove.kills import run_difference
 from sb3_roles.prove.small_runs import ITERATION, small_settings
-from sb3_roles.zoo import job, stop_signals, training
+from sb3_roles.zoo import job, training
 from sb3_roles.zoo.algorithms import ALGORITHMS
 from sb3_roles.zoo.cli import main
 from sb3_roles.zoo.config import write_yaml
@@ -141,7 +141,7 @@ def test_a_signal_while_a_file_is_replaced_waits_for_it(tmp_path, monkeypatch):
 
 def test_the_second_signal_ends_at_once(monkeypatch):
     stop = StopSignals()
-    monkeypatch.setattr(stop_signals, "SAME_STOP", 0.0)
+    monkeypatch.setattr(interrupts, "SAME_STOP", 0.0)
     with pytest.raises(SystemExit) as end, stop.caught(), stop.held():
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)

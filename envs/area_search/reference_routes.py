@@ -1,6 +1,7 @@
 """The joint look-ahead once more, in plain Python: slow, with sets, and independent of the kernels.
 
-The tests hold ``area_search.look_ahead`` to it bit for bit. It shares with it only its constants.
+The tests hold ``area_search.look_ahead`` to it bit for bit. It shares with it only its constants,
+and the formulas beside them.
 """
 
 from __future__ import annotations

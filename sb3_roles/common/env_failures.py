@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import sysconfig
 import traceback
 from collections.abc import Callable
@@ -59,6 +60,17 @@ def called(env: object, where: str, function: Callable[..., Any], *args: Any, **
         if type(error) is not SystemExit:
             raise  # The program's own, see ``zoo.stop_signals``.
         raise _failure(env, where, error) from error
+
+
+def close_or_warn(env: Any) -> None:
+    """Close environments; if that fails, say so on stderr: how the work ended matters more.
+
+    :param env: a vectorized environment whose ``close`` raises :class:`EnvironmentFailed`
+    """
+    try:
+        env.close()
+    except EnvironmentFailed as error:
+        print(f"warning: {error}", file=sys.stderr, flush=True)
 
 
 def place_of(error: BaseException, env: object = None) -> str:

@@ -344,4 +344,11 @@ class SuperSuitTeamVecEnv(TeamVecEnv):
         return self._recorders[team].render()
 
     def _close(self) -> None:
-        self._vec.close()
+        errors = []
+        for recorder in self._recorders:
+            try:
+                recorder.close()
+            except EnvironmentFailed as error:
+                errors.append(error)
+        if errors:
+            raise errors[0]

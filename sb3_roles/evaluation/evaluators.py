@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from area_search.scenes import Scene, get_scene
 from sb3_roles.baselines.area import area_scenes
 from sb3_roles.common.callbacks import Evaluate
-from sb3_roles.common.env_failures import EnvironmentFailed
+from sb3_roles.common.env_failures import EnvironmentFailed, close_or_warn
 from sb3_roles.common.env_state import env_name
 from sb3_roles.common.team_wrapper import find_team_env
 from sb3_roles.common.thresholds import first_above
@@ -211,7 +211,7 @@ class VecEnvEvaluator:
 
     def close(self) -> None:
         """Release the environment."""
-        self.env.close()
+        close_or_warn(self.env)
 
 
 def make_evaluator(

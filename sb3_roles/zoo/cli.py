@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
 from sb3_roles._version import __version__
 from sb3_roles.common.env_failures import EnvironmentFailed
-from sb3_roles.common.interrupts import interrupt_once
+from sb3_roles.common.interrupts import interrupt_once, leave_at_interrupt
 from sb3_roles.zoo.options import Parser, UsageError
 
 COMMANDS = (
@@ -69,8 +68,7 @@ def main(argv: Sequence[str] | None = None, script: str | None = None) -> int:
     try:
         return _main(sys.argv[1:], script)
     finally:
-        # The process ends; a Ctrl-C now would have the interpreter print a traceback.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        leave_at_interrupt()
 
 
 def _main(arguments: Sequence[str], script: str | None) -> int:

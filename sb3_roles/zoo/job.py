@@ -23,7 +23,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_roles.common.callbacks import RoleCallback, TeamMetricsCallback
 from sb3_roles.common.checkpoint import CheckpointError, CheckpointFolder
-from sb3_roles.common.env_failures import EnvironmentFailed
+from sb3_roles.common.env_failures import EnvironmentFailed, close_or_warn
 from sb3_roles.common.files import remove_partial
 from sb3_roles.common.group_play import RolloutsLost
 from sb3_roles.common.names import one_line
@@ -119,7 +119,7 @@ def run_job(job: Mapping[str, Any], stop: StopSignals | None = None) -> int:
             finally:
                 lock.release()
     finally:
-        env.close()
+        close_or_warn(env)
 
 
 def _resuming(run: Path, config: Mapping[str, Any]) -> str:

@@ -21,6 +21,7 @@ from sb3_roles.common.checkpoint import (
     read_checkpoint,
 )
 from sb3_roles.common.checkpoint_reading import Outline, read_outline
+from sb3_roles.common.env_failures import EnvironmentFailed
 from sb3_roles.common.not_finite import guard_optimizer
 from sb3_roles.common.role_wrapper import RoleWrapper
 from sb3_roles.common.snapshot import load_weights
@@ -67,6 +68,8 @@ def make_env(config: Mapping[str, Any], n_envs: int | None = None) -> VecEnv:
         if algorithm.wrapper == "team":
             return TeamWrapper(venv)
         roles = RoleWrapper(venv, **config["wrapper_kwargs"])
+    except EnvironmentFailed:
+        raise
     except (TypeError, ValueError) as error:
         raise UsageError(f"environment {config['env']}: {error}") from error
     if algorithm.whole_teams:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
 from sb3_roles.common.files import is_writing
-from sb3_roles.common.interrupts import SAME_STOP
+from sb3_roles.common.interrupts import begin_stop, is_same_stop
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STDERR = 2
@@ -33,7 +32,6 @@ class StopSignals:
         self.message = ""
         """to print when the first signal comes, for what may take a moment"""
         self._held = 0
-        self._when = 0.0
         self._at_once = ""
 
     @contextmanager
@@ -89,12 +87,12 @@ class StopSignals:
             raise KeyboardInterrupt
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        now = time.monotonic()
         if self.received is not None:
-            if now - self._when < SAME_STOP:
+            if is_same_stop():
                 return
             raise SecondSignal(128 + number)
-        self.received, self._when = number, now
+        begin_stop()
+        self.received = number
         message = self._at_once or self.message
         if message:
             # Not print: this may have interrupted it.
