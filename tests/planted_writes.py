@@ -12,15 +12,16 @@ from sb3_roles.prove import disk_trials, save_loops
 
 
 def in_place(path, write, check=None):
-    whole = io.BytesIO()
-    write(whole)
-    half = len(whole.getvalue()) // 2
+    buffer = io.BytesIO()
+    write(buffer)
+    whole = buffer.getvalue()
+    half = len(whole) // 2
     with open(path, "wb") as file:
-        file.write(whole.getvalue()[:half])
+        file.write(whole[:half])
         file.flush()
         # On a busy machine, too, most kills come here.
         time.sleep(0.02)
-        file.write(whole.getvalue()[half:])
+        file.write(whole[half:])
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import torch as th
 
-from sb3_roles.common.interrupts import begin_stop, interrupt
+from sb3_roles.common.interrupts import interrupt
 from sb3_roles.evaluation.grid.crews import Crew, Here, Make, Parcel, Task
 from sb3_roles.evaluation.grid.entrants import Entrants, Results
 from sb3_roles.evaluation.grid.plan import Plan
@@ -100,12 +100,8 @@ def _interruptible() -> Iterator[Callable[[], None]]:
 
     def hear(number: int, frame: FrameType | None) -> None:
         nonlocal heard
-        if heard:
-            interrupt(number, frame)
-            return
         heard = True
-        begin_stop()
-        raise KeyboardInterrupt
+        interrupt(number, frame)
 
     def check() -> None:
         if heard:
