@@ -9,7 +9,16 @@ import pytest
 from helpers import DOWN, LEFT, RIGHT, STOP, UP, hand_made
 
 from area_search import BatchedAreaSearch, Scene
-from area_search.look_ahead_data import CHANCES, DEPTH, discount_at, n_orders, unseen_worths
+from area_search.look_ahead_data import (
+    CERTAIN,
+    CHANCES,
+    DEPTH,
+    LEAST_ODDS,
+    discount_at,
+    n_orders,
+    passable_odds,
+    unseen_worths,
+)
 from sb3_roles.baselines import controller_class
 from sb3_roles.evaluation.episodes import run_episodes
 
@@ -102,16 +111,38 @@ def test_unseen_cells_are_worth_the_targets_to_be_expected():
     density = batch.scene.n_targets / batch.scene.n_free
     assert CHANCES[4] == 0.0
     assert 0 < got[6 + RIGHT] < 0.01 * density
-    # An unseen cell in a corridor has known obstacles on two sides. Two come into view, with the
-    # second step and the third.
-    rows = ["########", "#0...???", "########"]
-    batch = hand_made(rows, sub_goal="routes")
+
+
+def test_a_route_goes_on_through_unseen_cells_as_far_as_its_way_may_be_open():
+    open_place = ["?" * 20] * 3
+    batch = hand_made([*open_place, "#0.." + "?" * 16, *open_place], sub_goal="routes")
     (got,) = batch.observations["sub_goal"][0, :, ROUTE]
-    density = batch.scene.n_targets / batch.scene.n_free
-    check(got, [RIGHT], 2)
-    # Worths are rounded to 1 / 1024 of a target.
-    expected = unseen_worths(density, 1, batch.scene.horizon)[2] * late(2, 3)
-    assert got[6 + RIGHT] == pytest.approx(expected, abs=late(2, 3) / 2048 + 1e-5)
+    check(got, [RIGHT], 1)
+    scene = batch.scene
+    worth = unseen_worths(scene.n_targets / scene.n_free, 1, scene.horizon)[0]
+    odds = passable_odds()[0] / CERTAIN
+    n_unseen = int(np.log(LEAST_ODDS) / np.log(odds))
+    assert 2 <= n_unseen <= DEPTH - 2
+    # Straight on, first over two known cells. Of the cells that come into view with a step, one is
+    # known with the first step, and none is later.
+    new = [4] + [5] * (1 + n_unseen)
+    chances = [1.0, 1.0] + [odds**k for k in range(1, n_unseen + 1)]
+    gains = [worth * n * p * late(k + 1) for k, (n, p) in enumerate(zip(new, chances, strict=True))]
+    # It is at least worth this, and more than what known cells alone would be.
+    assert got[6 + RIGHT] > 0.98 * sum(gains)
+    assert got[6 + RIGHT] > 1.5 * sum(gains[:2])
+
+
+def test_a_target_behind_an_unseen_cell_counts_by_the_chance_of_the_way():
+    odds = passable_odds() / CERTAIN
+    assert odds[2] < LEAST_ODDS < odds[1] < odds[0] < 1
+    known = features(["#######", "#0...T#"])[0]
+    # The unseen cell on the way has an obstacle on one side; the other one, which comes into view,
+    # is hardly worth anything.
+    (got,) = features(["#######", "#0.?.T#", "###?###"])
+    assert odds[1] * known[6 + RIGHT] <= got[6 + RIGHT] < (odds[1] + 0.01) * known[6 + RIGHT]
+    # With obstacles on two sides it can hardly be free.
+    assert not features(["#######", "#0.?.T#"]).any()
 
 
 def test_what_is_expected_counts_more_where_robots_have_less_to_do():

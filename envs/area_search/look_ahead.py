@@ -1,11 +1,11 @@
 """Joint look-ahead: short routes for all robots of a team over what it knows, in numba.
 
-A route is a sequence of moves over known free cells. It is worth what it covers and sees, each as
-much less as it comes later: a known target counts 1, an unseen cell as many targets as may be
-expected on it. A robot looks for the route worth most; what a team mate's route gets earlier counts
-only by the time that it comes sooner, so that the worths of a team's routes add up. Robots plan one
-after the other, and once more in the light of what all others plan; of the plans that different
-robots begin, the best one counts.
+A route is a sequence of moves over known free cells, and over unseen ones that may well be free. It
+is worth what it covers and sees, each as much less as it comes later and as its way may be blocked:
+a known target counts 1, an unseen cell as many targets as may be expected on it. A robot looks for
+the route worth most; what a team mate's route gets earlier counts only by the time that it comes
+sooner, so that the worths of a team's routes add up. Robots plan one after the other, and once more
+in the light of what all others plan; of the plans that different robots begin, the best one counts.
 
 Nothing is kept from one step to the next: routes are a function of the map, the positions and the
 number of steps left.
@@ -16,12 +16,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from area_search.cells import KNOWN_TARGET, N_ACTIONS
+from area_search.cells import EXPLORED, KNOWN_TARGET, N_ACTIONS
 from area_search.look_ahead_data import (
+    CERTAIN,
     NONE,
+    ODDS_BITS,
     WORTH_SCALE,
     Labels,
     Marks,
+    Plans,
     Routes,
     Rules,
     Timetable,
@@ -45,13 +48,16 @@ def _claim_cell(
 
 @njit(cache=True)
 def _claim(cells: np.ndarray, i: int, rules: Rules, routes: Routes, marks: Marks) -> None:
-    """Claim for a robot what its route gets, with the discount at which it gets it."""
+    """Claim for a robot what its route gets, with the discount at which it may get it."""
     discounts, disc = rules.discounts, rules.disc
     last, firm = discounts.shape[0] - 1, discounts[rules.firm]
     route, robbed, sight, unseen = routes.cells, routes.robbed, marks.sight, marks.unseen
+    odds = CERTAIN
     for k in range(routes.lengths[i]):
         cell = route[i, k]
-        discount = discounts[min(k + 1, last)]
+        if not cells[cell] & EXPLORED:
+            odds = odds * marks.passable[cell] >> ODDS_BITS
+        discount = discounts[min(k + 1, last)] * odds >> ODDS_BITS
         if cells[cell] & KNOWN_TARGET:
             _claim_cell(i, cell, discount, firm, marks, robbed)
         if sight[cell] > 0:
@@ -120,6 +126,17 @@ def _plan_in_turn(
 
 
 @njit(cache=True)
+def _copy(routes: Routes, to: Routes) -> None:
+    """Copy the routes of a team."""
+    to.lengths[:] = routes.lengths
+    to.first[:] = routes.first
+    to.worth[:] = routes.worth
+    to.begin[:] = routes.begin
+    for i in range(routes.lengths.shape[0]):
+        to.cells[i, : routes.lengths[i]] = routes.cells[i, : routes.lengths[i]]
+
+
+@njit(cache=True)
 def plan_routes(
     cells: np.ndarray,
     border: int,
@@ -128,30 +145,28 @@ def plan_routes(
     timetable: Timetable,
     marks: Marks,
     labels: Labels,
-    routes: Routes,
+    plans: Plans,
 ) -> None:
     """Plan the routes of a team.
 
     :param cells: uint8 (height + 2 border, width + 2 border), its map
     :param position: int32 (n_agents, 2)
     :param steps: of its episode so far
-    :param routes: overwritten; a robot for which team mates leave nothing plans as if it were
+    :param plans: overwritten; a robot for which team mates leave nothing plans as if it were
         alone, and if nothing can be reached its route is empty
     """
-    starts = routes.starts
+    draft = plans.draft
+    starts = draft.starts
     for i in range(starts.shape[0]):
         starts[i] = (position[i, 0] + border) * cells.shape[1] + position[i, 1] + border
     rules = rules_at(timetable, timetable.rules.left - steps)
     flat = cells.reshape(-1)
-    best_total, best = -1, 0
-    for order in range(rules.orders):
-        # The plan that is begun by the first robot comes last: often it needs no other.
-        first = rules.orders - 1 - order
-        total = _plan_in_turn(first, flat, rules, marks, labels, routes)
-        if total >= best_total:
-            best_total, best = total, first
-    if best > 0:
-        _plan_in_turn(best, flat, rules, marks, labels, routes)
+    best_total = -1
+    for first in range(rules.orders):
+        total = _plan_in_turn(first, flat, rules, marks, labels, draft)
+        if total > best_total:
+            best_total = total
+            _copy(draft, plans.best)
     forget(marks)
 
 
@@ -165,7 +180,7 @@ def route_goals(
     timetable: Timetable,
     marks: Marks,
     labels: Labels,
-    routes: Routes,
+    plans: Plans,
     table: np.ndarray,
     out: np.ndarray,
 ) -> None:
@@ -180,11 +195,11 @@ def route_goals(
         the moves with which the robot's route can begin, ``0.9 ** steps`` until it gets anything,
         and per first move the worth of the best route found, in targets; all 0 without a route
     """
-    row = out.shape[2] - 1
+    row, routes = out.shape[2] - 1, plans.best
     for m in range(position.shape[0]):
         if not which[m]:
             continue
-        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, routes)
+        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
         for i in range(position.shape[1]):
             features = out[m, i, row]
             begin = routes.begin[i] if routes.lengths[i] > 0 else NONE

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from area_search.cells import EXPLORED, KNOWN_TARGET, N_ACTIONS, OBSTACLE
-from area_search.look_ahead_data import NONE, Labels, Marks, Routes, Rules
+from area_search.look_ahead_data import CERTAIN, NONE, ODDS_BITS, Labels, Marks, Routes, Rules
 
 _KNOWN_FREE = EXPLORED
 _KNOWN = EXPLORED | OBSTACLE
@@ -25,6 +25,7 @@ def _look(cells: np.ndarray, rules: Rules, cell: int, marks: Marks) -> int:
             for action in range(1, N_ACTIONS):
                 n_obstacles += (cells[seen + rules.offsets[action]] & _KNOWN) == _KNOWN
             marks.unseen[seen] = rules.worths[n_obstacles]
+            marks.passable[seen] = rules.passable[n_obstacles]
             marks.noted[1, marks.n_noted[1]] = seen
             marks.n_noted[1] += 1
         total += marks.unseen[seen]
@@ -57,17 +58,19 @@ def search(
 
     A route that comes to a cell with no more than another had there, at that time or before, is
     given up, and so is one that falls far behind the best. Nothing is gained twice in one cell.
+    A route may lead through unseen cells that are seen from the cell before, as long as its way may
+    well be open; what it gets from there on counts by the chance of that.
 
     :param respect: 1 to count only what is gained over the claims, 0 to count all
     :return: number of labels, and the index of the best
     """
     cell_of, value_of, parent_of, first_of = labels.cell, labels.value, labels.parent, labels.first
-    best, slot, claims = labels.best, labels.slot, marks.claims
+    odds_of, best, slot, claims = labels.odds, labels.best, labels.slot, marks.claims
     sights, unseen, offsets = marks.sight, marks.unseen, rules.offsets
     edges, edge_counts, discounts = rules.edges, rules.edge_counts, rules.discounts
     target, depth, slack, left = rules.target, rules.depth, rules.slack, rules.left
     cell_of[0], value_of[0], parent_of[0], first_of[0] = start, 0, NONE, 0
-    best[start], slot[start] = 0, 0
+    odds_of[0], best[start], slot[start] = CERTAIN, 0, 0
     low, high, top, top_value, t = 0, 1, 0, 0, 0
     last = discounts.shape[0] - 1
     while low < high and t < left and (t < depth or top_value == 0):
@@ -81,22 +84,28 @@ def search(
                 continue
             for action in range(1, N_ACTIONS):
                 cell = cell_of[k] + offsets[action]
+                odds = odds_of[k]
                 if cells[cell] & _KNOWN != _KNOWN_FREE:
-                    continue
-                value = before
+                    if cells[cell] & EXPLORED or unseen[cell] == 0:
+                        continue
+                    odds = odds * marks.passable[cell] >> ODDS_BITS
+                    if odds < rules.least_odds:
+                        continue
+                got = 0
                 if cells[cell] & KNOWN_TARGET:
-                    value += target * max(0, discount - respect * claims[cell])
+                    got = target * max(0, discount - respect * claims[cell])
                 sight = sights[cell]
                 if sight < 0:
                     sight = _look(cells, rules, cell, marks)
                 if sight > 0:
-                    if value + sight * discount < best[cell]:
+                    if before + ((got + sight * discount) * odds >> ODDS_BITS) < best[cell]:
                         continue
                     for q in range(edge_counts[action]):
                         seen = cell + edges[action, q]
                         gain = discount - respect * claims[seen]
                         if gain > 0:
-                            value += unseen[seen] * gain
+                            got += unseen[seen] * gain
+                value = before + (got * odds >> ODDS_BITS)
                 if value < best[cell]:
                     continue
                 here = slot[cell]
@@ -123,6 +132,7 @@ def search(
                     slot[cell] = here
                     cell_of[here] = cell
                 value_of[here], parent_of[here], first_of[here] = value, k, first
+                odds_of[here] = odds
                 if value > top_value:
                     top, top_value = here, value
         low, high = high, end

@@ -18,6 +18,7 @@ Cell = tuple[int, int]
 MOVES: tuple[Cell, ...] = ((0, 0), (-1, 0), (0, 1), (1, 0), (0, -1))
 _UNIT = 1 << 10
 _FINEST = 1 << 20
+_SURE = 1 << 10
 
 
 @cache
@@ -28,10 +29,11 @@ def discount(steps: int, left: int) -> int:
 
 @dataclass
 class Label:
-    """A partial route: its cells from the start on, what it is worth, how it may begin."""
+    """A partial route: its cells from the start on, worth, chance to be open, how it may begin."""
 
     path: list[Cell]
     value: int = 0
+    odds: int = _SURE
     first: set[int] = field(default_factory=set)
     begin: int = 0
 
@@ -58,12 +60,24 @@ class TeamMap:
     left: int
     known_gains: dict[tuple[Cell, Cell], dict[Cell, int]] = field(default_factory=dict)
 
-    def unseen_worth(self, cell: Cell) -> int:
-        """Return the worth of an unseen cell; off the map all is known to be obstacles."""
+    def obstacles_beside(self, cell: Cell) -> int:
+        """Count the known obstacles beside a cell; off the map all is known to be obstacles."""
         beside = [(cell[0] + dr, cell[1] + dc) for dr, dc in MOVES[1:]]
-        obstacles = sum(c not in self.ground and c not in self.unexplored for c in beside)
-        worth = constants.unseen_worths(self.density, self.n_agents, self.left)[obstacles] * _UNIT
-        return max(1, round(float(worth)))
+        return sum(c not in self.ground and c not in self.unexplored for c in beside)
+
+    def unseen_worth(self, cell: Cell) -> int:
+        """Return the worth of an unseen cell."""
+        worths = constants.unseen_worths(self.density, self.n_agents, self.left)
+        return max(1, round(float(worths[self.obstacles_beside(cell)] * _UNIT)))
+
+    def odds_after(self, odds: int, before: Cell, cell: Cell) -> int:
+        """Return the chance that a way is open, with one more move."""
+        if cell in self.ground:
+            return odds
+        # Nobody walks blind: a cell has to be in view, too, for the next one to be entered.
+        if cell not in self.unexplored or cell not in self.disc(before):
+            return 0
+        return odds * int(constants.passable_odds()[self.obstacles_beside(cell)]) // _SURE
 
     def gains(self, before: Cell, cell: Cell) -> dict[Cell, int]:
         """Return what a move gets: the worth of a target, and of the cells that come into view."""
@@ -84,6 +98,7 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
     """
     labels, layer = [Label([start])], [Label([start])]
     best, top, t = {start: 0}, labels[0], 0
+    least = int(constants.LEAST_ODDS * _SURE)
     while layer and t < known.left and (t < constants.DEPTH or top.value == 0):
         t += 1
         present = discount(t, known.left)
@@ -95,11 +110,14 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
             for action in range(1, 5):
                 before = label.path[-1]
                 cell = (before[0] + MOVES[action][0], before[1] + MOVES[action][1])
-                if cell not in known.ground:
+                odds = known.odds_after(label.odds, before, cell)
+                if odds < least:
                     continue
-                value = label.value
-                for got, worth in known.gains(before, cell).items():
-                    value += worth * max(0, present - claims.get(got, (0, 0))[0])
+                new = sum(
+                    worth * max(0, present - claims.get(got, (0, 0))[0])
+                    for got, worth in known.gains(before, cell).items()
+                )
+                value = label.value + new * odds // _SURE
                 if value > label.value and cell in label.path:
                     value = label.value
                     if value <= best[cell]:
@@ -113,6 +131,7 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
                 begin = label.begin or (t if value > 0 else 0)
                 better = following.setdefault(cell, Label([]))
                 better.path, better.value = [*label.path, cell], value
+                better.odds = odds
                 better.first, better.begin = set(first), begin
                 if value > top.value:
                     top = better
@@ -151,16 +170,18 @@ class TeamRoutes:
     def claim(self, i: int, claims: dict[Cell, tuple[int, int]]) -> None:
         """Claim what a robot's route gets, and note who gets less by that."""
         left = self.known.left
-        path = self.found[i][0].path
+        path, odds = self.found[i][0].path, _SURE
         for t, cell in enumerate(path[1:], start=1):
+            odds = self.known.odds_after(odds, path[t - 1], cell)
+            claim = discount(t, left) * odds // _SURE
             for got in ({cell} & self.known.targets) | (
                 self.known.disc(cell) & self.known.unexplored
             ):
                 owned, owner = claims.get(got, (0, i))
-                if owned < discount(t, left):
+                if owned < claim:
                     if owner != i and owned >= discount(constants.FIRM, left):
                         self.robbed.add(owner)
-                    claims[got] = (discount(t, left), i)
+                    claims[got] = (claim, i)
 
     def total(self) -> int:
         """Return what all routes are worth together."""

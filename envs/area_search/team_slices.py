@@ -145,7 +145,7 @@ class TeamSlice:
                 look_ahead_data.make_timetable(scene, stride),
                 look_ahead_data.make_marks(area),
                 look_ahead_data.make_labels(area),
-                look_ahead_data.make_routes(arrays.n_agents, area),
+                look_ahead_data.make_plans(arrays.n_agents, area),
                 paths.discount_table(),
                 out,
             )

@@ -18,11 +18,11 @@ from area_search.look_ahead import plan_routes
 from area_search.look_ahead_data import (
     Labels,
     Marks,
-    Routes,
+    Plans,
     Timetable,
     make_labels,
     make_marks,
-    make_routes,
+    make_plans,
     make_timetable,
 )
 from sb3_roles.baselines.greedy import Walker, first_move, random_bits
@@ -41,7 +41,7 @@ class LookAheadController(Walker):
             make_timetable(self.batch.scene, self.batch.cells.shape[2]),
             make_marks(area),
             make_labels(area),
-            make_routes(n, area),
+            make_plans(n, area),
             np.zeros((n_teams, n), np.int64),  # heading
         )
 
@@ -60,7 +60,7 @@ def _walk_routes(
     timetable: Timetable,
     marks: Marks,
     labels: Labels,
-    routes: Routes,
+    plans: Plans,
     heading: np.ndarray,
     actions: np.ndarray,
 ) -> None:
@@ -68,9 +68,9 @@ def _walk_routes(
 
     :param heading: int64 (n_teams, n_agents), the last actions
     """
-    n_agents = position.shape[1]
+    n_agents, routes = position.shape[1], plans.best
     for m in range(position.shape[0]):
-        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, routes)
+        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
         for i in range(n_agents):
             action = 0
             if routes.lengths[i] > 0:
