@@ -20,7 +20,7 @@ def same(a: Any, b: Any) -> bool:
     return bool(np.array_equal(np.asarray(a), np.asarray(b)))
 
 
-@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes"])
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes", "role_routes"])
 @pytest.mark.parametrize("early_stop_patience", [None, 4])
 @pytest.mark.parametrize("instance", [True, False])
 def test_native_and_supersuit_play_the_same_episodes(

@@ -43,7 +43,7 @@ def assert_same(first: list[dict[str, np.ndarray]], second: list[dict[str, np.nd
             np.testing.assert_array_equal(value, other[name])
 
 
-@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes"])
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes", "role_routes"])
 def test_threads_change_nothing(sub_goal: str) -> None:
     expected = play(make(1, sub_goal))
     assert any(step["truncated"].any() for step in expected)

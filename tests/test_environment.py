@@ -376,7 +376,7 @@ def test_the_explored_share_counts_the_start_discs_from_the_beginning() -> None:
 TASK = get_scene(
     "medium", n_agents=3, early_stop_patience=10, reward_sharing="same_role", horizon=30
 )
-SUB_GOALS = ["none", "nearest", "assigned", "routes"]
+SUB_GOALS = ["none", "nearest", "assigned", "routes", "role_routes"]
 
 
 @pytest.mark.parametrize("sub_goal", SUB_GOALS)
@@ -778,7 +778,7 @@ def test_scenes_are_not_changed_by_playing() -> None:
     assert before == SCENES
 
 
-@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes"])
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes", "role_routes"])
 def test_steps_allocate_nothing(sub_goal: str) -> None:
     """Arrays stay where they are, and the traced memory does not depend on the maps' size."""
     batch = BatchedAreaSearch("hard", 64, sub_goal)

@@ -584,7 +584,7 @@ def test_messages_can_be_switched_off():
     assert model.policy.communicate
 
 
-@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes"])
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes", "role_routes"])
 def test_the_sub_goal_is_that_of_the_training(sub_goal):
     controller = PolicyController(tiny_policy(sub_goal))
     assert controller.sub_goal == sub_goal

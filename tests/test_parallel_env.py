@@ -111,7 +111,7 @@ def test_states_of_the_environment_are_copies_too() -> None:
     np.testing.assert_equal(env.state(), before)
 
 
-@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes"])
+@pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes", "role_routes"])
 def test_gymnasium_and_sb3_accept_a_robot_on_its_own(sub_goal: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -44,7 +44,7 @@ def observation_space(
     """Return one robot's observation space; no shape depends on the number of robots.
 
     :param scene: the task
-    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"``, ``"routes"`` or ``"role_routes"``
     :param known_map: with the key ``known``
     :param time: with the key ``time``
     :return: flat Dict of ``local`` uint8 (4, side, side), ``joint`` uint8 (2, height, width),
@@ -81,7 +81,7 @@ class TeamArrays:
 
     :param scenes: the task; of several, each is played by an equal share of consecutive teams
     :param n_teams: number of teams
-    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"``, ``"routes"`` or ``"role_routes"``
     :param known_map: observe the key ``known``, too
     :param n_threads: see :attr:`n_threads`
     :param time: observe the key ``time``, too

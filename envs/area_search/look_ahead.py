@@ -99,6 +99,24 @@ def _settle(cells: np.ndarray, rules: Rules, routes: Routes, marks: Marks) -> in
 
 
 @njit(cache=True)
+def _search_and_keep(
+    i: int,
+    cells: np.ndarray,
+    target: int,
+    see: int,
+    rules: Rules,
+    marks: Marks,
+    labels: Labels,
+    routes: Routes,
+) -> None:
+    """Plan for a robot over what is claimed, or as if it were alone if that leaves it nothing."""
+    n_labels, top = search(cells, routes.starts[i], 1, target, see, rules, marks, labels)
+    if top == 0:
+        n_labels, top = search(cells, routes.starts[i], 0, target, see, rules, marks, labels)
+    keep(i, n_labels, top, labels, routes)
+
+
+@njit(cache=True)
 def _plan_in_turn(
     first: int, cells: np.ndarray, rules: Rules, marks: Marks, labels: Labels, routes: Routes
 ) -> int:
@@ -117,10 +135,7 @@ def _plan_in_turn(
                 if j != i:
                     _claim(cells, j, rules, routes, marks)
         routes.robbed[i] = False
-        n_labels, top = search(cells, routes.starts[i], 1, rules, marks, labels)
-        if top == 0:
-            n_labels, top = search(cells, routes.starts[i], 0, rules, marks, labels)
-        keep(i, n_labels, top, labels, routes)
+        _search_and_keep(i, cells, rules.target, CERTAIN, rules, marks, labels, routes)
         _claim(cells, i, rules, routes, marks)
     return _settle(cells, rules, routes, marks)
 
@@ -134,6 +149,32 @@ def _copy(routes: Routes, to: Routes) -> None:
     to.begin[:] = routes.begin
     for i in range(routes.lengths.shape[0]):
         to.cells[i, : routes.lengths[i]] = routes.cells[i, : routes.lengths[i]]
+
+
+@njit(cache=True)
+def _plan(
+    cells: np.ndarray,
+    border: int,
+    position: np.ndarray,
+    steps: int,
+    timetable: Timetable,
+    marks: Marks,
+    labels: Labels,
+    plans: Plans,
+) -> None:
+    """Plan the routes of a team, and leave the notes on its map."""
+    draft = plans.draft
+    starts = draft.starts
+    for i in range(starts.shape[0]):
+        starts[i] = (position[i, 0] + border) * cells.shape[1] + position[i, 1] + border
+    rules = rules_at(timetable, timetable.rules.left - steps)
+    flat = cells.reshape(-1)
+    best_total = -1
+    for first in range(rules.orders):
+        total = _plan_in_turn(first, flat, rules, marks, labels, draft)
+        if total > best_total:
+            best_total = total
+            _copy(draft, plans.best)
 
 
 @njit(cache=True)
@@ -155,19 +196,42 @@ def plan_routes(
     :param plans: overwritten; a robot for which team mates leave nothing plans as if it were
         alone, and if nothing can be reached its route is empty
     """
-    draft = plans.draft
-    starts = draft.starts
-    for i in range(starts.shape[0]):
-        starts[i] = (position[i, 0] + border) * cells.shape[1] + position[i, 1] + border
-    rules = rules_at(timetable, timetable.rules.left - steps)
-    flat = cells.reshape(-1)
-    best_total = -1
-    for first in range(rules.orders):
-        total = _plan_in_turn(first, flat, rules, marks, labels, draft)
-        if total > best_total:
-            best_total = total
-            _copy(draft, plans.best)
+    _plan(cells, border, position, steps, timetable, marks, labels, plans)
     forget(marks)
+
+
+@njit(cache=True)
+def _describe(i: int, routes: Routes, table: np.ndarray, features: np.ndarray) -> None:
+    """Write the features of a robot's route, see :func:`route_goals`."""
+    begin = routes.begin[i] if routes.lengths[i] > 0 else NONE
+    encode(features[: N_ACTIONS + 1], begin, routes.first[i], table)
+    for action in range(N_ACTIONS):
+        features[N_ACTIONS + 1 + action] = routes.worth[i, action] / WORTH_SCALE
+
+
+@njit(cache=True)
+def _plan_in_roles(
+    i: int,
+    cells: np.ndarray,
+    rules: Rules,
+    roles: np.ndarray,
+    marks: Marks,
+    labels: Labels,
+    plans: Plans,
+    table: np.ndarray,
+    features: np.ndarray,
+) -> None:
+    """Write the features of a robot's route in each role, if all team mates follow the plan."""
+    routes, n_agents = plans.best, plans.best.lengths.shape[0]
+    for j in range(n_agents):
+        if j != i:
+            _claim(cells, j, rules, routes, marks)
+    for role in range(roles.shape[0]):
+        target = rules.target * roles[role, 0] >> ODDS_BITS
+        _search_and_keep(i, cells, target, roles[role, 1], rules, marks, labels, plans.draft)
+        _describe(i, plans.draft, table, features[role])
+    for j in range(n_agents):
+        _release(j, rules.disc, routes, marks)
 
 
 @njit(cache=True, nogil=True)
@@ -182,6 +246,7 @@ def route_goals(
     labels: Labels,
     plans: Plans,
     table: np.ndarray,
+    in_roles: bool,
     out: np.ndarray,
 ) -> None:
     """Per robot: how its route begins, and what routes are worth by first move.
@@ -191,18 +256,23 @@ def route_goals(
     :param position: int32 (n_teams, n_agents, 2)
     :param steps: int32 (n_teams,), steps of the episodes so far
     :param table: int64, see :func:`~area_search.paths.discount_table`
+    :param in_roles: write a row for each role, too
     :param out: float32 (n_teams, n_agents, rows, 11); the last row is overwritten: five flags of
         the moves with which the robot's route can begin, ``0.9 ** steps`` until it gets anything,
-        and per first move the worth of the best route found, in targets; all 0 without a route
+        and per first move the worth of the best route found, in targets; all 0 without a route.
+        With ``in_roles``, the first rows are overwritten with the same of the route that the robot
+        would take in each role, over what the others' routes get
     """
-    row, routes = out.shape[2] - 1, plans.best
     for m in range(position.shape[0]):
         if not which[m]:
             continue
-        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
+        _plan(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
+        rules = rules_at(timetable, timetable.rules.left - steps[m])
         for i in range(position.shape[1]):
-            features = out[m, i, row]
-            begin = routes.begin[i] if routes.lengths[i] > 0 else NONE
-            encode(features[: N_ACTIONS + 1], begin, routes.first[i], table)
-            for action in range(N_ACTIONS):
-                features[N_ACTIONS + 1 + action] = routes.worth[i, action] / WORTH_SCALE
+            features = out[m, i]
+            _describe(i, plans.best, table, features[features.shape[0] - 1])
+            if in_roles:
+                flat = cells[m].reshape(-1)
+                roles = timetable.roles
+                _plan_in_roles(i, flat, rules, roles, marks, labels, plans, table, features)
+        forget(marks)

@@ -46,6 +46,11 @@ CHANCES = (0.74, 0.5, 0.1, 0.02, 0.0)
 Between what teams of this look-ahead meet in the paper's scenes with 40 % obstacles (0.69, 0.44,
 0.1, 0.01, 0.01) and with 16 %; that of ``greedy_assigned`` meets more free cells.
 """
+ROLE_WORTHS = ((0.2, 1.0), (1.0, 0.2))
+"""What known targets and unseen cells count in the roles explore and cover, next to the plan of all.
+
+Far apart, so that a robot's choice of a role matters.
+"""
 OPTIMISM = 1.2
 """How much likelier than that a route may count on walking through an unseen cell.
 
@@ -107,12 +112,14 @@ class Timetable(NamedTuple):
     """The rules of a scene, by the number of steps that are left of an episode.
 
     ``rules``, those of an episode's beginning; ``discounts`` int64 (k, n) and ``worths``
-    int64 (k, 5), see :class:`Rules`, by the number of steps left, the last row for all above.
+    int64 (k, 5), see :class:`Rules`, by the number of steps left, the last row for all above;
+    ``roles`` int64 (2, 2), ``ROLE_WORTHS`` as parts of ``CERTAIN``.
     """
 
     rules: Rules
     discounts: np.ndarray
     worths: np.ndarray
+    roles: np.ndarray
 
 
 @njit(cache=True)
@@ -234,6 +241,14 @@ def passable_odds() -> np.ndarray:
     return np.minimum(CERTAIN, np.round(np.array(CHANCES) * OPTIMISM * CERTAIN)).astype(np.int64)
 
 
+def role_worths() -> np.ndarray:
+    """Return ``ROLE_WORTHS`` in fixed point.
+
+    :return: int64 (2, 2), by role those of a known target and of unseen cells, of ``CERTAIN``
+    """
+    return np.round(np.array(ROLE_WORTHS) * CERTAIN).astype(np.int64)
+
+
 def n_orders(n_agents: int) -> int:
     """Return how many plans a team makes, see ``ORDERS`` and ``ROUTES``.
 
@@ -277,7 +292,7 @@ def make_timetable(scene: Scene, stride: int) -> Timetable:
         ROUNDS,
         n_orders(scene.n_agents),
     )
-    return Timetable(rules, discounts, worths)
+    return Timetable(rules, discounts, worths, role_worths())
 
 
 def make_marks(area: int) -> Marks:

@@ -50,6 +50,8 @@ def search(
     cells: np.ndarray,
     start: int,
     respect: int,
+    target: int,
+    see: int,
     rules: Rules,
     marks: Marks,
     labels: Labels,
@@ -62,13 +64,15 @@ def search(
     well be open; what it gets from there on counts by the chance of that.
 
     :param respect: 1 to count only what is gained over the claims, 0 to count all
+    :param target: worth of a known target
+    :param see: part of their worth that unseen cells count, of ``CERTAIN``
     :return: number of labels, and the index of the best
     """
     cell_of, value_of, parent_of, first_of = labels.cell, labels.value, labels.parent, labels.first
     odds_of, best, slot, claims = labels.odds, labels.best, labels.slot, marks.claims
     sights, unseen, offsets = marks.sight, marks.unseen, rules.offsets
     edges, edge_counts, discounts = rules.edges, rules.edge_counts, rules.discounts
-    target, depth, slack, left = rules.target, rules.depth, rules.slack, rules.left
+    depth, slack, left = rules.depth, rules.slack, rules.left
     cell_of[0], value_of[0], parent_of[0], first_of[0] = start, 0, NONE, 0
     odds_of[0], best[start], slot[start] = CERTAIN, 0, 0
     low, high, top, top_value, t = 0, 1, 0, 0, 0
@@ -100,11 +104,13 @@ def search(
                 if sight > 0:
                     if before + ((got + sight * discount) * odds >> ODDS_BITS) < best[cell]:
                         continue
+                    view = 0
                     for q in range(edge_counts[action]):
                         seen = cell + edges[action, q]
                         gain = discount - respect * claims[seen]
                         if gain > 0:
-                            got += unseen[seen] * gain
+                            view += unseen[seen] * gain
+                    got += view * see >> ODDS_BITS
                 value = before + (got * odds >> ODDS_BITS)
                 if value < best[cell]:
                     continue

@@ -43,7 +43,7 @@ class AreaSearchEnv(ParallelEnv[str, dict[str, np.ndarray], int]):
 
     :param scene: a :class:`Scene` or the name of one; a list of such, a mix, can be played by
         several teams alone, see :meth:`batched`
-    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"``, ``"routes"`` or ``"role_routes"``
     :param known_map: observe the team's map, too
     :param time: observe the share of the horizon that is left, too
     :param render_mode: ``None``, ``"rgb_array"`` or ``"human"`` (a pygame window)

@@ -21,7 +21,7 @@ from area_search.cells import (
 )
 
 GOAL_SETS = ("frontier", "target")
-SUB_GOALS = ("none", "nearest", "assigned", "routes")
+SUB_GOALS = ("none", "nearest", "assigned", "routes", "role_routes")
 SUB_GOAL_DISCOUNT = 0.9
 
 # Discounted distances are summed as integers, so that a sum does not depend on its order.
@@ -32,10 +32,11 @@ SCALE = float(1 << _SCALE_BITS)
 def sub_goal_shape(sub_goal: str) -> tuple[int, int]:
     """Rows and columns of a robot's path features.
 
-    A row per goal set, and with "routes" one for the robot's route; in columns first moves and
-    nearness, and unless it is "nearest" what there is to gain by first move.
+    A row per goal set, with "routes" one more for the robot's route, and with "role_routes" before all
+    these one for its route in each role; in columns first moves and nearness, and unless it is
+    "nearest" what there is to gain by first move.
     """
-    rows = len(GOAL_SETS) + (sub_goal == "routes")
+    rows = len(GOAL_SETS) + {"routes": 1, "role_routes": 1 + len(GOAL_SETS)}.get(sub_goal, 0)
     return rows, N_ACTIONS + 1 + (sub_goal != "nearest") * N_ACTIONS
 
 

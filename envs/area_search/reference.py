@@ -66,7 +66,7 @@ class ReferenceAreaSearch:
     :param scene: the task
     :param seed: seed of the stream
     :param episode: number of the episode in the stream
-    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"`` or ``"routes"``
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"``, ``"routes"`` or ``"role_routes"``
     :param known_map: observe the team's map, too
     :param time: observe the share of the horizon that is left, too
     """
@@ -299,16 +299,19 @@ class ReferenceAreaSearch:
         ground = self.explored & self.free
         distances = [self._distances(robot, ground) for robot in self.robots]
         width = 6 if self.sub_goal == "nearest" else 11
-        rows = 3 if self.sub_goal == "routes" else 2
+        rows = {"routes": 3, "role_routes": 5}.get(self.sub_goal, 2)
         out = np.zeros((len(self.robots), rows, width), np.float32)
-        if self.sub_goal == "routes":
+        if self.sub_goal in ("routes", "role_routes"):
             unexplored = set(self.all_cells) - self.explored
             density = self.scene.n_targets / self.scene.n_free
             left = max(1, self.scene.horizon - self.n_steps)
             team_map = TeamMap(
                 ground, known, unexplored, self.disc, density, len(self.robots), left
             )
-            out[:, 2] = route_features(team_map, self.robots)
+            in_roles = self.sub_goal == "role_routes"
+            out[:, -1], out[:, : 2 * in_roles] = route_features(team_map, self.robots, in_roles)
+        # The rows of the goal sets, behind those of the roles.
+        of_goals = out[:, 2:4] if self.sub_goal == "role_routes" else out
         for k, goals in enumerate((frontier, known)):
             if self.sub_goal == "nearest":
                 chosen = [_nearest(goals, near) for near in distances]
@@ -317,10 +320,10 @@ class ReferenceAreaSearch:
             for i, robot in enumerate(self.robots):
                 for goal in chosen[i]:
                     flags = self._first_moves(robot, goal, ground)
-                    out[i, k, :5] = np.maximum(out[i, k, :5], flags)
-                    out[i, k, 5] = _worth(distances[i][goal]) / _SCALE
+                    of_goals[i, k, :5] = np.maximum(of_goals[i, k, :5], flags)
+                    of_goals[i, k, 5] = _worth(distances[i][goal]) / _SCALE
                 if self.sub_goal != "nearest":
-                    out[i, k, 6:] = self._territory(i, goals, distances, ground)
+                    of_goals[i, k, 6:] = self._territory(i, goals, distances, ground)
         return out
 
     def _match(

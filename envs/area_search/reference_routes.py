@@ -90,10 +90,18 @@ class TeamMap:
         return self.known_gains[before, cell]
 
 
-def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> list[Label]:
-    """Search for routes of one robot.
+def search(
+    known: TeamMap,
+    start: Cell,
+    claims: dict[Cell, tuple[int, int]],
+    take: int = _SURE,
+    see: int = _SURE,
+) -> list[Label]:
+    """Search for routes of one robot; if team mates leave it nothing, as if it were alone.
 
     :param claims: by cell the best discount at which a team mate gets it, and the mate
+    :param take: what known targets count
+    :param see: what unseen cells count
     :return: all labels, the best one first; that of the start alone if nothing is to be gained
     """
     labels, layer = [Label([start])], [Label([start])]
@@ -113,11 +121,14 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
                 odds = known.odds_after(label.odds, before, cell)
                 if odds < least:
                     continue
-                new = sum(
-                    worth * max(0, present - claims.get(got, (0, 0))[0])
-                    for got, worth in known.gains(before, cell).items()
-                )
-                value = label.value + new * odds // _SURE
+                taken, view = 0, 0
+                for got, worth in known.gains(before, cell).items():
+                    gain = max(0, present - claims.get(got, (0, 0))[0])
+                    if got in known.targets:
+                        taken += worth * take // _SURE * gain
+                    else:
+                        view += worth * gain
+                value = label.value + (taken + view * see // _SURE) * odds // _SURE
                 if value > label.value and cell in label.path:
                     value = label.value
                     if value <= best[cell]:
@@ -137,6 +148,8 @@ def search(known: TeamMap, start: Cell, claims: dict[Cell, tuple[int, int]]) -> 
                     top = better
         layer = list(following.values())
         labels += layer
+    if top.value == 0 and claims:
+        return search(known, start, {}, take, see)
     return [top, *(label for label in labels if label is not top)]
 
 
@@ -163,8 +176,6 @@ class TeamRoutes:
                         self.claim(j, claims)
                 self.robbed.discard(i)
                 self.found[i] = search(known, robots[i], claims)
-                if self.found[i][0].value == 0:
-                    self.found[i] = search(known, robots[i], {})
                 self.claim(i, claims)
 
     def claim(self, i: int, claims: dict[Cell, tuple[int, int]]) -> None:
@@ -194,22 +205,41 @@ class TeamRoutes:
         )
 
 
-def route_features(known: TeamMap, robots: list[Cell]) -> np.ndarray:
-    """Return the row of ``sub_goal="routes"`` that is for the robot's route.
-
-    :return: float32 (n_agents, 11)
-    """
-    out = np.zeros((len(robots), 11), np.float32)
+def _best_plan(known: TeamMap, robots: list[Cell]) -> TeamRoutes:
     begins = range(constants.n_orders(len(robots)))
-    plans = [TeamRoutes(known, robots, begin) for begin in begins]
-    for i, (top, *others) in enumerate(max(plans, key=TeamRoutes.total).found):
-        if top.value == 0:
-            continue
-        out[i, list(top.first)] = 1.0
-        out[i, 5] = _nearness(top.begin)
+    return max((TeamRoutes(known, robots, begin) for begin in begins), key=TeamRoutes.total)
+
+
+def route_features(
+    known: TeamMap, robots: list[Cell], in_roles: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of ``sub_goal`` that are for a robot's route, and for that in each role.
+
+    :return: float32 (n_agents, 11) and (n_agents, 2, 11), or (n_agents, 0, 11) without roles
+    """
+    begins = range(constants.n_orders(len(robots)))
+    plan = max((TeamRoutes(known, robots, begin) for begin in begins), key=TeamRoutes.total)
+    roles = constants.role_worths().tolist() if in_roles else []
+    of_roles = np.zeros((len(robots), len(roles), 11), np.float32)
+    for i, robot in enumerate(robots):
+        claims: dict[Cell, tuple[int, int]] = {}
+        for j in range(len(robots)):
+            if j != i:
+                plan.claim(j, claims)
+        for role, (take, see) in enumerate(roles):
+            of_roles[i, role] = _features(search(known, robot, claims, take, see))
+    return np.array([_features(found) for found in plan.found]), of_roles
+
+
+def _features(found: list[Label]) -> np.ndarray:
+    out = np.zeros(11, np.float32)
+    top, *others = found
+    if top.value > 0:
+        out[list(top.first)] = 1.0
+        out[5] = _nearness(top.begin)
         for label in (top, *others):
             for action in label.first:
-                out[i, 6 + action] = max(out[i, 6 + action], label.value / (_UNIT * _FINEST))
+                out[6 + action] = max(out[6 + action], label.value / (_UNIT * _FINEST))
     return out
 
 

@@ -122,20 +122,22 @@ class TeamSlice:
             "nearest": paths.nearest_sub_goals,
             "assigned": assignment.assigned_sub_goals,
             "routes": assignment.assigned_sub_goals,
+            "role_routes": assignment.assigned_sub_goals,
         }[arrays.sub_goal]
         if self._sub_goal_kernel is not None:
-            scratch = paths.search_scratch(arrays.sub_goal, arrays.n_agents, cells[0].size)
             out = arrays.observations["sub_goal"][teams]
+            in_roles = arrays.sub_goal == "role_routes"
             self._sub_goal_arguments: tuple[Any, ...] = (
                 cells,
                 border,
                 position,
                 goals,
-                *scratch,
-                out,
+                *paths.search_scratch(arrays.sub_goal, arrays.n_agents, cells[0].size),
+                # Behind the rows of the roles.
+                out[:, :, 2:] if in_roles else out,
             )
         self._route_arguments: tuple[Any, ...] = ()
-        if arrays.sub_goal == "routes":
+        if arrays.sub_goal in ("routes", "role_routes"):
             area, stride = cells[0].size, cells.shape[2]
             self._route_arguments = (
                 cells,
@@ -147,6 +149,7 @@ class TeamSlice:
                 look_ahead_data.make_labels(area),
                 look_ahead_data.make_plans(arrays.n_agents, area),
                 paths.discount_table(),
+                in_roles,
                 out,
             )
 

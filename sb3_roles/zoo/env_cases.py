@@ -104,7 +104,7 @@ def _native(scene: Scene, sub_goal: str) -> Case:
 
     from area_search import BatchedAreaSearch
 
-    n_teams = N_TEAMS_ROUTES if sub_goal == "routes" else N_TEAMS
+    n_teams = N_TEAMS_ROUTES if "routes" in sub_goal else N_TEAMS
     batch = BatchedAreaSearch(scene, n_teams, sub_goal)
     batch.reset(0)
     actions = _actions((n_teams, scene.n_agents))

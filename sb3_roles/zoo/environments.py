@@ -19,7 +19,7 @@ from sb3_roles.zoo.stop_signals import SecondSignal
 AREA_SEARCH = "area-search-v0"
 ENVIRONMENTS: dict[str, str] = {AREA_SEARCH: "area_search:AreaSearchEnv"}
 # area_search has both lists, behind numba, which takes a second to import.
-SUB_GOALS = ("none", "nearest", "assigned", "routes")
+SUB_GOALS = ("none", "nearest", "assigned", "routes", "role_routes")
 GOAL_SETS = ("frontier", "target")
 REWARD_COMPONENTS = ("explore", "cover")
 # Observations that are there on demand; arguments that are true or false.
