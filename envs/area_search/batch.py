@@ -31,8 +31,8 @@ class BatchedAreaSearch(TeamArrays):
     :param scene: a :class:`Scene` or the name of one; or a list of such, a mix, of which each is
         played by an equal share of consecutive teams, see ``scenes.get_scenes``
     :param n_teams: number of teams
-    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"``, ``"routes"`` or ``"role_routes"``; which path features
-        (``area_search.paths``) join the observation
+    :param sub_goal: ``"none"``, ``"nearest"``, ``"assigned"``, ``"routes"`` or ``"role_routes"``;
+        which path features (``area_search.paths``) join the observation
     :param known_map: observe the team's map under the key ``known``, see :meth:`show_known_map`
     :param n_threads: threads that work on the teams of a step; it changes no result
     :param time: observe the share of the horizon that is left under the key ``time``, see

@@ -47,7 +47,7 @@ Between what teams of this look-ahead meet in the paper's scenes with 40 % obsta
 0.1, 0.01, 0.01) and with 16 %; that of ``greedy_assigned`` meets more free cells.
 """
 ROLE_WORTHS = ((0.2, 1.0), (1.0, 0.2))
-"""What known targets and unseen cells count in the roles explore and cover, next to the plan of all.
+"""What known targets and unseen cells count in the roles explore and cover, beside the joint plan.
 
 Far apart, so that a robot's choice of a role matters.
 """

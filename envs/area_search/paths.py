@@ -32,8 +32,8 @@ SCALE = float(1 << _SCALE_BITS)
 def sub_goal_shape(sub_goal: str) -> tuple[int, int]:
     """Rows and columns of a robot's path features.
 
-    A row per goal set, with "routes" one more for the robot's route, and with "role_routes" before all
-    these one for its route in each role; in columns first moves and nearness, and unless it is
+    A row per goal set, with "routes" one more for the robot's route, and with "role_routes" before
+    all these one for its route in each role; in columns first moves and nearness, and unless it is
     "nearest" what there is to gain by first move.
     """
     rows = len(GOAL_SETS) + {"routes": 1, "role_routes": 1 + len(GOAL_SETS)}.get(sub_goal, 0)
