@@ -17,6 +17,7 @@ from area_search.look_ahead_data import (
     discount_at,
     n_orders,
     passable_odds,
+    role_worths,
     unseen_worths,
 )
 from sb3_roles.baselines import controller_class
@@ -170,6 +171,42 @@ def test_the_rows_of_the_goal_sets_are_those_of_assigned():
         assert routes.shape == (8, 3, 3, 11)
         assert np.array_equal(routes[:, :, :ROUTE], assigned)
         assert routes[:, :, ROUTE].any()
+        actions = rng.integers(0, 5, (8, 3))
+        for batch in batches:
+            batch.step(actions)
+
+
+def test_in_each_role_a_robot_has_a_route_of_its_own():
+    # Unseen cells on the left, a target on the right.
+    batch = hand_made(["?????????", "??...0..T", "?????????"], sub_goal="role_routes")
+    explore, cover, _, target, joint = batch.observations["sub_goal"][0, 0]
+    assert joint.shape == (11,)
+    assert explore[:5].argmax() == LEFT
+    assert cover[:5].tolist() == target[:5].tolist() == [0, 0, 1, 0, 0]
+    weights = role_worths() / CERTAIN
+    assert cover[6 + RIGHT] >= weights[1, 0] * late(3) * 0.99
+    # What the role counts less is worth less to it, and all to the joint plan.
+    assert explore[6 + RIGHT] < joint[6 + RIGHT]
+    assert cover[6 + LEFT] < joint[6 + LEFT]
+
+
+def test_in_roles_too_robots_leave_what_team_mates_plan_for():
+    rows = ["##################", "#T..0........1..T#"]
+    got = hand_made(rows, sub_goal="role_routes").observations["sub_goal"][0]
+    for role, part in enumerate(role_worths()[:, 0] / CERTAIN):
+        check(got[0, role], [LEFT], 3, {LEFT: part * late(3)})
+        check(got[1, role], [RIGHT], 3, {RIGHT: part * late(3)})
+
+
+def test_the_rows_behind_those_of_the_roles_are_those_of_routes():
+    batches = [BatchedAreaSearch(SMALL, 8, name) for name in ("routes", "role_routes")]
+    rng = np.random.default_rng(0)
+    for batch in batches:
+        batch.reset(3)
+    for _ in range(SMALL.horizon):
+        routes, in_roles = (batch.observations["sub_goal"] for batch in batches)
+        assert in_roles.shape == (8, 3, 5, 11)
+        assert np.array_equal(in_roles[:, :, 2:], routes)
         actions = rng.integers(0, 5, (8, 3))
         for batch in batches:
             batch.step(actions)

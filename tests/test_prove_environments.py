@@ -9,6 +9,7 @@ import pytest
 
 from area_search import SCENES, BatchedAreaSearch, get_scene
 from area_search import cells as layout
+from area_search.paths import SUB_GOALS
 from area_search.reference import ReferenceAreaSearch
 from sb3_roles.prove import environments, planted
 from sb3_roles.prove.promises import Setting
@@ -165,12 +166,12 @@ def test_the_parts_are_what_is_promised() -> None:
         assert {(part.scene.name, part.scene.n_agents) for part in parts} == {
             (name, n) for name in SCENES for n in environments.ROBOTS
         }
-        assert {part.sub_goal for part in parts} == {"none", "nearest", "assigned", "routes"}
+        assert {part.sub_goal for part in parts} == set(SUB_GOALS)
     for quick, least in ((False, 20_000), (True, 300)):
         parts = list(environments._compared_parts(quick))
         assert sum(part.n_teams * part.n_steps for part in parts) >= least
         assert len({(part.scene.name, part.scene.n_agents) for part in parts}) == 28
-        assert {part.sub_goal for part in parts} == {"none", "nearest", "assigned", "routes"}
+        assert {part.sub_goal for part in parts} == set(SUB_GOALS)
 
 
 @pytest.mark.parametrize(

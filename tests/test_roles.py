@@ -287,7 +287,7 @@ def at_the_end(env, n_steps):
 
 
 @pytest.mark.parametrize("role_every", [1, 3])
-@pytest.mark.parametrize("sub_goal", ["nearest", "assigned", "routes"])
+@pytest.mark.parametrize("sub_goal", ["nearest", "assigned", "routes", "role_routes"])
 def test_the_last_observation_has_the_role_that_the_rule_would_give_next(sub_goal, role_every):
     options = {"role_control": "nearest", "role_every": role_every}
     env = small_search(sub_goal=sub_goal, roles=options, early_stop_patience=3)
@@ -400,10 +400,12 @@ def test_the_nearest_goal_makes_the_role(name, names):
 
 def by_nearness(sub_goal):
     """The rule, written out: the target unless the frontier is nearer."""
-    return np.where(sub_goal[:, 0, 5] > sub_goal[:, 1, 5], 0, 1)
+    # Routes in roles, which are no goals, come before the goals.
+    frontier, target = (2, 3) if sub_goal.shape[1] == 5 else (0, 1)
+    return np.where(sub_goal[:, frontier, 5] > sub_goal[:, target, 5], 0, 1)
 
 
-@pytest.mark.parametrize("sub_goal", ["nearest", "assigned", "routes"])
+@pytest.mark.parametrize("sub_goal", ["nearest", "assigned", "routes", "role_routes"])
 @pytest.mark.parametrize("backend", ["native", "supersuit"])
 @pytest.mark.parametrize("role_every", [1, 3])
 def test_roles_by_the_rule_are_given_and_last(sub_goal, backend, role_every):

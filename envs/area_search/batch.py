@@ -193,7 +193,9 @@ class BatchedAreaSearch(TeamArrays):
             return {}
         # Behind the first moves, see ``area_search.paths``.
         order = ("target", "frontier")
-        return {name: ("sub_goal", (paths.GOAL_SETS.index(name), N_ACTIONS)) for name in order}
+        first = len(paths.GOAL_SETS) if self.sub_goal == "role_routes" else 0
+        rows = {name: first + paths.GOAL_SETS.index(name) for name in order}
+        return {name: ("sub_goal", (row, N_ACTIONS)) for name, row in rows.items()}
 
     def _metrics_so_far(self, team: int) -> dict[str, float]:
         """Metrics of the running episode; ``metrics`` are those of the last step."""

@@ -24,14 +24,15 @@ _VARIANTS: tuple[tuple[str, float, dict[str, Any]], ...] = (
     ("none", 0.5, {}),
     ("nearest", 0.3, {"early_stop_patience": 10, "reward_sharing": "same_role"}),
     ("assigned", 0.19, {"team_share": 0.3}),
-    ("routes", 0.01, {}),
+    ("routes", 0.006, {}),
+    ("role_routes", 0.004, {}),
 )
 _JOINT_STEPS, _QUICK_JOINT_STEPS = 1_000_000, 20_000
 _REFERENCE_STEPS, _QUICK_REFERENCE_STEPS = 20_000, 300
 # In plain Python, large teams and routes are slow: shares of the joint steps by ROBOTS, and by
 # sub-goals.
 _ROBOT_SHARES = (0.4, 0.3, 0.2, 0.1)
-_COMPARED = {"none": 0.4, "nearest": 0.32, "assigned": 0.26, "routes": 0.02}
+_COMPARED = {"none": 0.4, "nearest": 0.32, "assigned": 0.26, "routes": 0.012, "role_routes": 0.008}
 _SHORT = 8
 
 
@@ -56,8 +57,8 @@ def _watched_parts(quick: bool) -> Iterator[_Part]:
         # One variant each, in turn, the next team size of a scene another one.
         teams = -(-_QUICK_JOINT_STEPS // (len(scenes) * _STEPS))
         for i, scene in enumerate(scenes):
-            sub_goal, _, options = _VARIANTS[(i + i // len(ROBOTS)) % len(_VARIANTS)]
-            size = (1, _STEPS // 8) if sub_goal == "routes" else (4 * teams + 7, _STEPS // 4)
+            sub_goal, _, options = _VARIANTS[i % len(_VARIANTS)]
+            size = (1, _STEPS // 8) if "routes" in sub_goal else (5 * teams + 7, _STEPS // 4)
             # Short episodes, so that some of them end.
             short = scene.with_options(horizon=_STEPS // 5, **options)
             yield _Part(short, sub_goal, *size, i)
@@ -141,16 +142,16 @@ def _compared_parts(quick: bool) -> Iterator[_Part]:
     for i, scene in enumerate(scenes):
         robots, number = ROBOTS.index(scene.n_agents), i * len(_COMPARED)
         if quick:
-            sub_goal = list(_COMPARED)[(i + i // len(ROBOTS)) % len(_COMPARED)]
+            sub_goal = list(_COMPARED)[i % len(_COMPARED)]
             steps = (
-                1 if sub_goal == "routes" else -(-_QUICK_REFERENCE_STEPS * 4 // 3 // len(scenes))
+                1 if "routes" in sub_goal else -(-_QUICK_REFERENCE_STEPS * 5 // 3 // len(scenes))
             )
             yield _Part(scene.with_options(horizon=_SHORT), sub_goal, 1, steps, number)
             continue
         for k, (sub_goal, share) in enumerate(_COMPARED.items()):
             most = _REFERENCE_STEPS * _ROBOT_SHARES[robots] * share / len(SCENES)
             # Of routes there are few steps: short episodes, so that some of them end.
-            options = {"horizon": _SHORT} if sub_goal == "routes" else {}
+            options = {"horizon": _SHORT} if "routes" in sub_goal else {}
             yield _Part(scene.with_options(**options), sub_goal, 1, int(np.ceil(most)), number + k)
 
 
