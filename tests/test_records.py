@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from dataclasses import fields, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -96,6 +98,26 @@ def test_records_come_back_as_they_were(controller, scene, tmp_path):
     expected[[0, 10]] = np.nan
     np.testing.assert_array_equal(back.bounds, expected)
     assert ("cover_bound" in summarize(back)) == known
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted in /proc")
+def test_arrow_starts_no_threads(recorded, tmp_path):
+    # One that is left when the process ends may abort it, when all of its work is done.
+    path = tmp_path / "records.parquet"
+    write_records(recorded, path)
+    code = (
+        "import os, sys\n"
+        "from sb3_roles.evaluation.records import read_records, write_records\n"
+        "import pyarrow.parquet\n"
+        "before = len(os.listdir('/proc/self/task'))\n"
+        "write_records(read_records(sys.argv[1]), sys.argv[1])\n"
+        "print(before, len(os.listdir('/proc/self/task')))\n"
+    )
+    output = subprocess.run(
+        [sys.executable, "-c", code, str(path)], check=True, capture_output=True, text=True
+    ).stdout
+    before, after = output.split()
+    assert before == after
 
 
 def test_long_horizons_have_wider_distances(tmp_path):
