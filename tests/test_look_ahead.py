@@ -161,16 +161,20 @@ def test_large_teams_make_fewer_plans():
     assert [n_orders(n) for n in (1, 3, 4, 8, 9, 11, 16, 17, 50)] == [1, 3, 4, 4, 3, 2, 2, 1, 1]
 
 
-def test_the_rows_of_the_goal_sets_are_those_of_assigned():
-    batches = [BatchedAreaSearch(SMALL, 8, name) for name in ("assigned", "routes")]
+@pytest.mark.parametrize(
+    ("less", "more", "n_rows", "shared"),
+    [("assigned", "routes", 3, slice(ROUTE)), ("routes", "role_routes", 5, slice(2, None))],
+)
+def test_further_routes_leave_the_other_rows_alone(less, more, n_rows, shared):
+    batches = [BatchedAreaSearch(SMALL, 8, name) for name in (less, more)]
     rng = np.random.default_rng(0)
     for batch in batches:
         batch.reset(3)
     for _ in range(SMALL.horizon):
-        assigned, routes = (batch.observations["sub_goal"] for batch in batches)
-        assert routes.shape == (8, 3, 3, 11)
-        assert np.array_equal(routes[:, :, :ROUTE], assigned)
-        assert routes[:, :, ROUTE].any()
+        fewer, rows = (batch.observations["sub_goal"] for batch in batches)
+        assert rows.shape == (8, 3, n_rows, 11)
+        assert np.array_equal(rows[:, :, shared], fewer)
+        assert all(rows[:, :, k].any() for k in range(n_rows))
         actions = rng.integers(0, 5, (8, 3))
         for batch in batches:
             batch.step(actions)
@@ -196,20 +200,6 @@ def test_in_roles_too_robots_leave_what_team_mates_plan_for():
     for role, part in enumerate(role_worths()[:, 0] / CERTAIN):
         check(got[0, role], [LEFT], 3, {LEFT: part * late(3)})
         check(got[1, role], [RIGHT], 3, {RIGHT: part * late(3)})
-
-
-def test_the_rows_behind_those_of_the_roles_are_those_of_routes():
-    batches = [BatchedAreaSearch(SMALL, 8, name) for name in ("routes", "role_routes")]
-    rng = np.random.default_rng(0)
-    for batch in batches:
-        batch.reset(3)
-    for _ in range(SMALL.horizon):
-        routes, in_roles = (batch.observations["sub_goal"] for batch in batches)
-        assert in_roles.shape == (8, 3, 5, 11)
-        assert np.array_equal(in_roles[:, :, 2:], routes)
-        actions = rng.integers(0, 5, (8, 3))
-        for batch in batches:
-            batch.step(actions)
 
 
 def test_routes_follow_from_the_state_alone():

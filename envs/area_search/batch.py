@@ -193,7 +193,7 @@ class BatchedAreaSearch(TeamArrays):
             return {}
         # Behind the first moves, see ``area_search.paths``.
         order = ("target", "frontier")
-        first = len(paths.GOAL_SETS) if self.sub_goal == "role_routes" else 0
+        first = paths.first_goal_row(self.sub_goal)
         rows = {name: first + paths.GOAL_SETS.index(name) for name in order}
         return {name: ("sub_goal", (row, N_ACTIONS)) for name, row in rows.items()}
 

@@ -152,32 +152,6 @@ def _copy(routes: Routes, to: Routes) -> None:
 
 
 @njit(cache=True)
-def _plan(
-    cells: np.ndarray,
-    border: int,
-    position: np.ndarray,
-    steps: int,
-    timetable: Timetable,
-    marks: Marks,
-    labels: Labels,
-    plans: Plans,
-) -> None:
-    """Plan the routes of a team, and leave the notes on its map."""
-    draft = plans.draft
-    starts = draft.starts
-    for i in range(starts.shape[0]):
-        starts[i] = (position[i, 0] + border) * cells.shape[1] + position[i, 1] + border
-    rules = rules_at(timetable, timetable.rules.left - steps)
-    flat = cells.reshape(-1)
-    best_total = -1
-    for first in range(rules.orders):
-        total = _plan_in_turn(first, flat, rules, marks, labels, draft)
-        if total > best_total:
-            best_total = total
-            _copy(draft, plans.best)
-
-
-@njit(cache=True)
 def plan_routes(
     cells: np.ndarray,
     border: int,
@@ -193,11 +167,22 @@ def plan_routes(
     :param cells: uint8 (height + 2 border, width + 2 border), its map
     :param position: int32 (n_agents, 2)
     :param steps: of its episode so far
+    :param marks: notes on the map are left, for further searches; :func:`forget` them then
     :param plans: overwritten; a robot for which team mates leave nothing plans as if it were
         alone, and if nothing can be reached its route is empty
     """
-    _plan(cells, border, position, steps, timetable, marks, labels, plans)
-    forget(marks)
+    draft = plans.draft
+    starts = draft.starts
+    for i in range(starts.shape[0]):
+        starts[i] = (position[i, 0] + border) * cells.shape[1] + position[i, 1] + border
+    rules = rules_at(timetable, timetable.rules.left - steps)
+    flat = cells.reshape(-1)
+    best_total = -1
+    for first in range(rules.orders):
+        total = _plan_in_turn(first, flat, rules, marks, labels, draft)
+        if total > best_total:
+            best_total = total
+            _copy(draft, plans.best)
 
 
 @njit(cache=True)
@@ -266,7 +251,7 @@ def route_goals(
     for m in range(position.shape[0]):
         if not which[m]:
             continue
-        _plan(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
+        plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
         rules = rules_at(timetable, timetable.rules.left - steps[m])
         for i in range(position.shape[1]):
             features = out[m, i]

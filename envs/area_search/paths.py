@@ -22,6 +22,7 @@ from area_search.cells import (
 
 GOAL_SETS = ("frontier", "target")
 SUB_GOALS = ("none", "nearest", "assigned", "routes", "role_routes")
+ROUTE_SUB_GOALS = ("routes", "role_routes")
 SUB_GOAL_DISCOUNT = 0.9
 
 # Discounted distances are summed as integers, so that a sum does not depend on its order.
@@ -36,8 +37,13 @@ def sub_goal_shape(sub_goal: str) -> tuple[int, int]:
     all these one for its route in each role; in columns first moves and nearness, and unless it is
     "nearest" what there is to gain by first move.
     """
-    rows = len(GOAL_SETS) + {"routes": 1, "role_routes": 1 + len(GOAL_SETS)}.get(sub_goal, 0)
+    rows = first_goal_row(sub_goal) + len(GOAL_SETS) + (sub_goal in ROUTE_SUB_GOALS)
     return rows, N_ACTIONS + 1 + (sub_goal != "nearest") * N_ACTIONS
+
+
+def first_goal_row(sub_goal: str) -> int:
+    """Row of a robot's path features with which those of the goal sets begin."""
+    return len(GOAL_SETS) if sub_goal == "role_routes" else 0
 
 
 def discount_table() -> np.ndarray:

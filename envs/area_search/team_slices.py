@@ -126,18 +126,16 @@ class TeamSlice:
         }[arrays.sub_goal]
         if self._sub_goal_kernel is not None:
             out = arrays.observations["sub_goal"][teams]
-            in_roles = arrays.sub_goal == "role_routes"
             self._sub_goal_arguments: tuple[Any, ...] = (
                 cells,
                 border,
                 position,
                 goals,
                 *paths.search_scratch(arrays.sub_goal, arrays.n_agents, cells[0].size),
-                # Behind the rows of the roles.
-                out[:, :, 2:] if in_roles else out,
+                out[:, :, paths.first_goal_row(arrays.sub_goal) :],
             )
         self._route_arguments: tuple[Any, ...] = ()
-        if arrays.sub_goal in ("routes", "role_routes"):
+        if arrays.sub_goal in paths.ROUTE_SUB_GOALS:
             area, stride = cells[0].size, cells.shape[2]
             self._route_arguments = (
                 cells,
@@ -149,7 +147,7 @@ class TeamSlice:
                 look_ahead_data.make_labels(area),
                 look_ahead_data.make_plans(arrays.n_agents, area),
                 paths.discount_table(),
-                in_roles,
+                arrays.sub_goal == "role_routes",
                 out,
             )
 

@@ -25,6 +25,7 @@ from area_search.look_ahead_data import (
     make_plans,
     make_timetable,
 )
+from area_search.look_ahead_search import forget
 from sb3_roles.baselines.greedy import Walker, first_move, random_bits
 
 
@@ -71,6 +72,7 @@ def _walk_routes(
     n_agents, routes = position.shape[1], plans.best
     for m in range(position.shape[0]):
         plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
+        forget(marks)
         for i in range(n_agents):
             action = 0
             if routes.lengths[i] > 0:
