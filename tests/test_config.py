@@ -164,8 +164,8 @@ FILES_BY_NAME = {path.stem: path for path in FILES}
                 "wrapper_kwargs": {"roles": ["cover", "explore"]},
                 "policy_kwargs": {"goal_key": "sub_goal"},
             },
-            "goal_key: the rows of sub_goal are for frontier and target, but the roles cover, "
-            "explore head for target, frontier",
+            "goal_key: the first rows of sub_goal are for frontier and target, but the roles "
+            "cover, explore head for target, frontier",
         ),
         ({"gama": 0.9}, "unknown key 'gama'.*did you mean 'gamma'"),
         ({"env_kwarg": {}}, "did you mean 'env_kwargs'"),

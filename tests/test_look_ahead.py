@@ -20,6 +20,7 @@ from area_search.look_ahead_data import (
     role_worths,
     unseen_worths,
 )
+from area_search.paths import ROLE_ROUTES
 from sb3_roles.baselines import controller_class
 from sb3_roles.evaluation.episodes import run_episodes
 
@@ -180,11 +181,22 @@ def test_further_routes_leave_the_other_rows_alone(less, more, n_rows, shared):
             batch.step(actions)
 
 
+def test_each_role_has_worths_that_the_search_can_bound():
+    worths = role_worths()
+    assert worths.shape == (len(ROLE_ROUTES), 2)
+    assert 0 <= worths.min() <= worths.max() == CERTAIN
+
+
+def test_a_robot_may_set_out_for_a_cell_that_it_has_not_seen_only_if_it_is_in_view():
+    # In play a start is always explored around; a state that is set may be otherwise.
+    rows = ["###.####", "##0?.T##", "###.####"]
+    assert hand_made(rows, sub_goal="routes").observations["sub_goal"][0, 0, ROUTE, RIGHT] == 1
+
+
 def test_in_each_role_a_robot_has_a_route_of_its_own():
     # Unseen cells on the left, a target on the right.
     batch = hand_made(["?????????", "??...0..T", "?????????"], sub_goal="role_routes")
     explore, cover, _, target, joint = batch.observations["sub_goal"][0, 0]
-    assert joint.shape == (11,)
     assert explore[:5].argmax() == LEFT
     assert cover[:5].tolist() == target[:5].tolist() == [0, 0, 1, 0, 0]
     weights = role_worths() / CERTAIN
@@ -274,11 +286,11 @@ def test_an_episode_is_the_same_in_any_batch():
 
 
 def test_it_beats_nearest_pairs():
-    """By 8 and 4 points on ``hard``; the standard errors of the differences are below 0.7."""
+    """By 13 and 7 points on ``hard``; the standard errors of the differences are below 0.7."""
     scores = {}
     for name in ("greedy_assigned", "look_ahead"):
         records = run_episodes(controller_class(name)(), "hard", 300, seed=7)
         scores[name] = [100 * records.curves[key][:, -1] for key in ("explo_paper", "cover")]
     gain = np.array(scores["look_ahead"]) - np.array(scores["greedy_assigned"])
-    assert gain[0].mean() > 5
-    assert gain[1].mean() > 2
+    assert gain[0].mean() > 10
+    assert gain[1].mean() > 5

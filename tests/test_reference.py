@@ -45,7 +45,8 @@ def random_scene(rng: np.random.Generator, largest: int) -> Scene:
     return scene.with_options(n_targets=int(rng.integers(1, scene.n_free + 1)))
 
 
-# 8 x 3 x 40 random scenes on small maps; together with the paper's scenes more than 1e5 steps.
+# Random scenes on small maps, 8 parts for each kind of sub-goal; with the paper's scenes more
+# than 1e5 steps in all.
 @pytest.mark.parametrize("sub_goal", ["none", "nearest", "assigned", "routes", "role_routes"])
 @pytest.mark.parametrize("part", range(8))
 def test_random_scenes(sub_goal: str, part: int) -> None:

@@ -252,12 +252,11 @@ def route_goals(
         if not which[m]:
             continue
         plan_routes(cells[m], border, position[m], steps[m], timetable, marks, labels, plans)
-        rules = rules_at(timetable, timetable.rules.left - steps[m])
+        rules, roles = rules_at(timetable, timetable.rules.left - steps[m]), timetable.roles
+        flat = cells[m].reshape(-1)
         for i in range(position.shape[1]):
             features = out[m, i]
             _describe(i, plans.best, table, features[features.shape[0] - 1])
             if in_roles:
-                flat = cells[m].reshape(-1)
-                roles = timetable.roles
                 _plan_in_roles(i, flat, rules, roles, marks, labels, plans, table, features)
         forget(marks)

@@ -44,20 +44,21 @@ CHANCES = (0.74, 0.5, 0.1, 0.02, 0.0)
 """Chance that an unseen cell near the team is free, by the known obstacles among its 4 neighbors.
 
 Between what teams of this look-ahead meet in the paper's scenes with 40 % obstacles (0.69, 0.44,
-0.1, 0.01, 0.01) and with 16 %; that of ``greedy_assigned`` meets more free cells.
-"""
-ROLE_WORTHS = ((0.2, 1.0), (1.0, 0.2))
-"""What known targets and unseen cells count in the roles explore and cover, beside the joint plan.
-
-Far apart, so that a robot's choice of a role matters.
+0.1, 0.01, 0.01) and with 16 %; teams of ``greedy_assigned`` meet more free cells.
 """
 OPTIMISM = 1.2
-"""How much likelier than that a route may count on walking through an unseen cell.
+"""How much likelier than ``CHANCES`` a route may count on walking through an unseen cell.
 
 A route that turns out to be blocked is planned anew, which costs less than never to try it.
 """
 LEAST_ODDS = 0.4
 """A route whose way is open with a smaller chance than this is given up."""
+ROLE_WORTHS = ((0.2, 1.0), (1.0, 0.2))
+"""What known targets and unseen cells count in the roles explore and cover, 1 in the joint plan.
+
+At most 1: the search bounds a role's gains by those of the joint plan. Far apart, so that a robot's
+choice of a role matters. A row for each of ``paths.ROLE_ROUTES``.
+"""
 SLACK = 1.5
 """A route that is behind the best by this many targets at the present discount is given up."""
 FIRM = 5
@@ -206,7 +207,10 @@ class Routes(NamedTuple):
 
 
 class Plans(NamedTuple):
-    """The routes of a team that are best so far, and those that are being planned."""
+    """The routes of a team that are best so far, and those that are being planned.
+
+    ``starts`` and ``robbed`` are those of the draft; they are not kept with the best.
+    """
 
     best: Routes
     draft: Routes

@@ -61,7 +61,9 @@ def search(
     A route that comes to a cell with no more than another had there, at that time or before, is
     given up, and so is one that falls far behind the best. Nothing is gained twice in one cell.
     A route may lead through unseen cells that are seen from the cell before, as long as its way may
-    well be open; what it gets from there on counts by the chance of that.
+    well be open; what it gets from there on counts by the chance of that. Of two ways that are
+    worth as much at the same time the first one found goes on, even if the other is likelier to be
+    open: to prefer that one does not change what teams cover.
 
     :param respect: 1 to count only what is gained over the claims, 0 to count all
     :param target: worth of a known target
@@ -75,6 +77,8 @@ def search(
     depth, slack, left = rules.depth, rules.slack, rules.left
     cell_of[0], value_of[0], parent_of[0], first_of[0] = start, 0, NONE, 0
     odds_of[0], best[start], slot[start] = CERTAIN, 0, 0
+    if sights[start] < 0:
+        _look(cells, rules, start, marks)
     low, high, top, top_value, t = 0, 1, 0, 0, 0
     last = discounts.shape[0] - 1
     while low < high and t < left and (t < depth or top_value == 0):
@@ -115,7 +119,7 @@ def search(
                 if value < best[cell]:
                     continue
                 here = slot[cell]
-                # Equally good at the same time: both ways are as good to begin with.
+                # Equally good at the same time: the robot may begin either way.
                 if value == best[cell] and here < high:
                     continue
                 if value > before:

@@ -23,6 +23,7 @@ from area_search.cells import (
 GOAL_SETS = ("frontier", "target")
 SUB_GOALS = ("none", "nearest", "assigned", "routes", "role_routes")
 ROUTE_SUB_GOALS = ("routes", "role_routes")
+ROLE_ROUTES = ("explore", "cover")
 SUB_GOAL_DISCOUNT = 0.9
 
 # Discounted distances are summed as integers, so that a sum does not depend on its order.
@@ -43,7 +44,7 @@ def sub_goal_shape(sub_goal: str) -> tuple[int, int]:
 
 def first_goal_row(sub_goal: str) -> int:
     """Row of a robot's path features with which those of the goal sets begin."""
-    return len(GOAL_SETS) if sub_goal == "role_routes" else 0
+    return len(ROLE_ROUTES) if sub_goal == "role_routes" else 0
 
 
 def discount_table() -> np.ndarray:

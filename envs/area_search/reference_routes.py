@@ -217,8 +217,7 @@ def route_features(
 
     :return: float32 (n_agents, 11) and (n_agents, 2, 11), or (n_agents, 0, 11) without roles
     """
-    begins = range(constants.n_orders(len(robots)))
-    plan = max((TeamRoutes(known, robots, begin) for begin in begins), key=TeamRoutes.total)
+    plan = _best_plan(known, robots)
     roles = constants.role_worths().tolist() if in_roles else []
     of_roles = np.zeros((len(robots), len(roles), 11), np.float32)
     for i, robot in enumerate(robots):

@@ -16,7 +16,7 @@ class NearestRole:
     """The role whose goal is nearest: for area search, cover when a known target is nearer.
 
     What is compared is what the robot observes. In area search with ``sub_goal="nearest"`` that is
-    the nearest goal of each kind; with ``"assigned"`` and ``"routes"`` it is the goal of each kind
+    the nearest goal of each kind; with all other kinds of sub-goals it is the goal of each kind
     that was assigned to this robot, however near others are, and a kind of which it was assigned
     none has nearness 0.
 

@@ -56,9 +56,9 @@ class RoleWrapper(TeamWrapper):
     :param role_every: steps that a role lasts
     :param role_control: ``"learned"``, ``"random"`` (uniform, every ``role_every`` steps),
         ``"nearest"`` (the role whose goal is nearest, or nearest of those assigned to the robot
-        with ``sub_goal="assigned"`` or ``"routes"``, every ``role_every`` steps, see
-        ``NearestRole``) or the name of the role that all robots act in. Random roles are a function
-        of the seed of ``seed()``, the team, and the numbers of episode and step
+        unless ``sub_goal="nearest"``, every ``role_every`` steps, see ``NearestRole``) or the name
+        of the role that all robots act in. Random roles are a function of the seed of ``seed()``,
+        the team, and the numbers of episode and step
     :raises ValueError: if an option is unknown or out of range, the actions are not discrete, or
         the environment does not observe what ``"nearest"`` needs
     """

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from area_search import SCENES, BatchedAreaSearch, Scene, get_scene
+from area_search.paths import ROUTE_SUB_GOALS
 from sb3_roles.prove.promises import Outcome, Setting
 from sb3_roles.prove.reference_play import SideBySide
 from sb3_roles.prove.search_rules import RULES
@@ -58,7 +59,7 @@ def _watched_parts(quick: bool) -> Iterator[_Part]:
         teams = -(-_QUICK_JOINT_STEPS // (len(scenes) * _STEPS))
         for i, scene in enumerate(scenes):
             sub_goal, _, options = _VARIANTS[i % len(_VARIANTS)]
-            size = (1, _STEPS // 8) if "routes" in sub_goal else (5 * teams + 7, _STEPS // 4)
+            size = (1, _STEPS // 8) if sub_goal in ROUTE_SUB_GOALS else (5 * teams + 7, _STEPS // 4)
             # Short episodes, so that some of them end.
             short = scene.with_options(horizon=_STEPS // 5, **options)
             yield _Part(short, sub_goal, *size, i)
@@ -143,15 +144,15 @@ def _compared_parts(quick: bool) -> Iterator[_Part]:
         robots, number = ROBOTS.index(scene.n_agents), i * len(_COMPARED)
         if quick:
             sub_goal = list(_COMPARED)[i % len(_COMPARED)]
-            steps = (
-                1 if "routes" in sub_goal else -(-_QUICK_REFERENCE_STEPS * 5 // 3 // len(scenes))
-            )
+            steps = -(-_QUICK_REFERENCE_STEPS * 5 // 3 // len(scenes))
+            if sub_goal in ROUTE_SUB_GOALS:
+                steps = 1
             yield _Part(scene.with_options(horizon=_SHORT), sub_goal, 1, steps, number)
             continue
         for k, (sub_goal, share) in enumerate(_COMPARED.items()):
             most = _REFERENCE_STEPS * _ROBOT_SHARES[robots] * share / len(SCENES)
             # Of routes there are few steps: short episodes, so that some of them end.
-            options = {"horizon": _SHORT} if "routes" in sub_goal else {}
+            options = {"horizon": _SHORT} if sub_goal in ROUTE_SUB_GOALS else {}
             yield _Part(scene.with_options(**options), sub_goal, 1, int(np.ceil(most)), number + k)
 
 

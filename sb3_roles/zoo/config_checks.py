@@ -238,8 +238,9 @@ def _mix_problems(config: Mapping[str, Any], n_scenes: int) -> list[str]:
 
 
 def _goal_problems(config: Mapping[str, Any]) -> list[str]:
-    """Rows of ``sub_goal`` are those of the goal sets, and a policy takes row k for role k."""
-    if config["env_kwargs"].get("sub_goal", "none") == "none":
+    """Check that there are sub-goals, and row k of them is for role k, as a policy takes it."""
+    sub_goal = config["env_kwargs"].get("sub_goal", "none")
+    if sub_goal == "none":
         lacking = [
             name
             for name, value in (
@@ -257,8 +258,9 @@ def _goal_problems(config: Mapping[str, Any]) -> list[str]:
     sets = tuple(role.goal_set for role in roles)
     if config["policy_kwargs"].get("goal_key") != "sub_goal" or sets == GOAL_SETS:
         return []
+    rows = "explore and cover" if sub_goal == "role_routes" else " and ".join(GOAL_SETS)
     return [
-        f"policy_kwargs.goal_key: the rows of sub_goal are for {' and '.join(GOAL_SETS)}, but the "
+        f"policy_kwargs.goal_key: the first rows of sub_goal are for {rows}, but the "
         f"roles {', '.join(role.name for role in roles)} head for "
         f"{', '.join(name or 'nothing' for name in sets)}"
     ]
