@@ -228,7 +228,8 @@ def test_evaluate_compares_on_the_same_episodes(trained, tmp_path, printed):
         second["metrics"]["cover"]["mean"] - first["metrics"]["cover"]["mean"]
     )
 
-    table = printed(*common, "--no-communication")
+    table = printed(*common, "--no-communication", "--out", str(out))
+    assert f"wrote {tmp_path / 'x-random.parquet'}" in table.splitlines()
     assert "differences to random on the same episodes" in table
     assert sum(line.startswith(str(trained)) for line in table.splitlines()) == 3
 

@@ -364,7 +364,7 @@ def test_bad_files(tmp_path, text, expected):
     ("env", "expected"),
     [
         ("no_such_module_:make", "ModuleNotFoundError"),
-        ("toy_envs:nothing", "AttributeError"),
+        ("toy_envs:nothing", "unknown factory of toy_envs 'nothing': allowed are "),
         ("builtins:dict", "must make a pettingzoo.ParallelEnv"),
         ("builtins:int", "fails|must make"),
     ],

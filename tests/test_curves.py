@@ -142,9 +142,36 @@ def test_bad_input_is_one_line(
 
 
 def test_a_folder_without_evaluations_is_refused(
+    tmp_path: Path, tell: Callable[..., tuple[int, str, str]]
+) -> None:
+    code, _, error = tell("curves", tmp_path)
+    assert (code, "config.yml" in error) == (2, True)
+    (tmp_path / "config.yml").write_text("algo: hmappo\n")
+    code, _, error = tell("curves", tmp_path)
+    assert (code, "--eval-freq" in error) == (2, True)
+
+
+def test_all_evaluations_of_a_short_run_are_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as stop:
-        raise SystemExit(main(["curves", str(tmp_path)]))
-    assert stop.value.code == 2
-    assert "evaluations.csv" in capsys.readouterr().err
+    run = make_run(tmp_path / "a", "hmappo", [0.1, 0.2, 0.3])
+    assert main(["curves", run, "--metrics", "cover"]) == 0
+    assert [line.split()[1] for line in capsys.readouterr().out.splitlines()[2:]] == [
+        "1,000",
+        "2,000",
+        "3,000",
+    ]
+
+
+def test_an_environment_of_ones_own_has_returns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "config.yml").write_text("algo: hmappo\n")
+    (tmp_path / "evaluations.csv").write_text("env_steps,return\n400,2.5\n800,7.25\n")
+    assert main(["curves", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "| joint steps | hmappo return |",
+        "|---|---|",
+        "| 400 | 2.5 [2.5 .. 2.5] |",
+        "| 800 | 7.2 [7.2 .. 7.2] |",
+    ]

@@ -556,6 +556,15 @@ def test_actors_with_nothing_to_read_are_refused():
         make_policy("hmappo", space)
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "name", "right"),
+    [(HMAPPO, "RolePolcy", "RolePolicy"), (MAPPO, "MlpPolicy", "TeamPolicy")],
+)
+def test_an_unknown_policy_is_named_with_what_is_allowed(algorithm, name, right):
+    with pytest.raises(ValueError, match=f"unknown policy '{name}': allowed are {right}"):
+        algorithm(name, TeamWrapper(small_search()))
+
+
 def test_policies_ask_for_the_wrappers():
     with pytest.raises(ValueError, match="TeamWrapper or RoleWrapper"):
         make_policy("mappo", spaces.Dict({"observation": spaces.Box(-1, 1, (3,))}))

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_roles.common.buffers import TeamRolloutBuffer
 from sb3_roles.common.checks import check_not_negative, check_positive, check_trusted, check_unit
 from sb3_roles.common.losses import StreamLoss, adapt_kl_coef, check_same_policy, stream_loss
+from sb3_roles.common.names import closest
 from sb3_roles.common.not_finite import NotFiniteError, check_loss, gradient_error
 from sb3_roles.common.policies import TeamPolicy
 from sb3_roles.common.rollout_steps import LocalPlayer, RolloutPlayer
@@ -171,6 +172,11 @@ class MAPPO(OnPolicyAlgorithm):
                 check_not_negative(**{name: schedule})
         if _init_setup_model:
             self._setup_model()
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ValueError(closest("policy", policy_name, self.policy_aliases))
+        return super()._get_policy_from_name(policy_name)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "player"]

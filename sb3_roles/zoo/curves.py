@@ -27,6 +27,8 @@ EVALUATIONS_FILE = "evaluations.csv"
 # Fractions, which are printed as percent.
 _FRACTIONS = ("explo_paper", "explo_true", "cover", "t90_share")
 _STEPS = "env_steps"
+_METRICS = ("explo_paper", "cover")
+_EVERY = 100_000
 
 
 @dataclass(frozen=True)
@@ -78,16 +80,17 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--metrics",
         nargs="+",
-        default=["explo_paper", "cover"],
+        default=None,
         metavar="NAME",
-        help="columns of evaluations.csv",
+        help="columns of evaluations.csv (default: explo_paper and cover, or else return)",
     )
     parser.add_argument(
         "--every",
         type=positive_number(1e12),
-        default=100_000,
+        default=None,
         metavar="N",
-        help="print the first evaluation after each N joint steps",
+        help="print the first evaluation after each N joint steps (default: 100000, or all of them "
+        "where no run is that long)",
     )
     parser.add_argument("--json", action="store_true", help="print all evaluations as JSON")
     parser.add_argument("--plot", type=output_file(".png"), metavar="FILE", help="draw them, too")
@@ -101,14 +104,32 @@ def run(args: Namespace) -> int:
     :return: exit code
     :raises UsageError: if a run has no evaluations, or no such metric
     """
-    curves = read_curves(args.runs, args.metrics)
+    metrics = args.metrics or _default_metrics(args.runs)
+    curves = read_curves(args.runs, metrics)
     if args.json:
-        print(json.dumps(_report(curves, args.metrics), indent=2))
+        print(json.dumps(_report(curves, metrics), indent=2))
     else:
-        print("\n".join(_table(curves, args.metrics, args.every)))
+        print("\n".join(_table(curves, metrics, args.every or _default_every(curves))))
     if args.plot:
-        _plot(curves, args.metrics, Path(args.plot))
+        _plot(curves, metrics, Path(args.plot))
     return 0
+
+
+def _default_metrics(runs: Sequence[str]) -> list[str]:
+    """Those of area search, or the return if a run is on an environment that has none of them."""
+    for _, folders in map(_folders, runs):
+        for folder in folders:
+            path = folder / EVALUATIONS_FILE
+            if path.is_file():
+                with open(path, newline="", encoding="utf-8", errors="replace") as file:
+                    if _METRICS[0] not in next(csv.reader(file), _METRICS):
+                        return ["return"]
+    return list(_METRICS)
+
+
+def _default_every(curves: Curves) -> int:
+    longest = max(run.steps[-1] for runs in curves.values() for run in runs)
+    return _EVERY if longest >= _EVERY else 1
 
 
 def read_curves(runs: Sequence[str], metrics: Sequence[str]) -> Curves:
@@ -125,9 +146,12 @@ def read_curves(runs: Sequence[str], metrics: Sequence[str]) -> Curves:
     for label, folders in [_folders(text) for text in runs]:
         for folder in folders:
             config = folder / CONFIG_FILE
-            if not (folder / EVALUATIONS_FILE).is_file() or not config.is_file():
+            if not config.is_file():
+                raise UsageError(f"{folder}: no run folder, it has no {CONFIG_FILE}")
+            if not (folder / EVALUATIONS_FILE).is_file():
                 raise UsageError(
-                    f"{folder}: no run folder with {EVALUATIONS_FILE} and {CONFIG_FILE}"
+                    f"{folder}: no evaluation yet: train makes one after each --eval-freq joint "
+                    f"steps, in {EVALUATIONS_FILE}"
                 )
             name = label
             if name is None:

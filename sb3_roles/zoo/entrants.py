@@ -13,7 +13,7 @@ from sb3_roles.evaluation.grid.entrants import Entrant
 from sb3_roles.zoo.config import CONFIG_FILE
 from sb3_roles.zoo.environments import AREA_SEARCH
 from sb3_roles.zoo.options import UsageError
-from sb3_roles.zoo.published import published_runs
+from sb3_roles.zoo.published import published, published_runs
 from sb3_roles.zoo.row_configs import training_command
 from sb3_roles.zoo.row_runs import (
     Report,
@@ -112,6 +112,8 @@ def find_entrants(
                 report(f"{name}: named by hand, its configuration is not the row's")
         chosen = named[name] if name in named else finder.find(row)
         shipped = [] if chosen else published_runs(row, report)
+        if chosen and name not in named and name in published():
+            report(f"{name}: not the weights that come with this package, for these runs are there")
         if not (chosen or shipped):
             report(f"{name} has no run in {logs}: {training_command(row, logs)}")
         entrants[name] = [run.entrant(row) for run in chosen]

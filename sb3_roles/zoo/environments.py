@@ -120,11 +120,19 @@ def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:
         # As python -m does: the console script would not find a module of the current folder.
         sys.path.insert(0, os.getcwd())
     try:
-        factory = getattr(import_module(module), name)
+        imported = import_module(module)
     except (Exception, SystemExit) as error:
         if isinstance(error, SecondSignal):
             raise
         raise UsageError(f"--env {env}: {type(error).__name__}: {error}") from error
+    factory = getattr(imported, name, None)
+    if factory is None:
+        known = [
+            one
+            for one, value in vars(imported).items()
+            if callable(value) and getattr(value, "__module__", None) == imported.__name__
+        ]
+        raise UsageError(f"--env {env}: {closest(f'factory of {module}', name, known)}")
 
     def make() -> Any:
         return factory(**env_kwargs)

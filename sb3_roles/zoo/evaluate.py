@@ -165,6 +165,8 @@ def run(args: Namespace) -> int:
         print(json.dumps(several if differences else reports[0], indent=2, allow_nan=False))
     else:
         print(comparison_of(reports, differences) if differences else table_of(reports[0]))
+        for file in (file for paths in files.values() for file in paths.values()):
+            print(f"wrote {file}")
     return 0
 
 
