@@ -5,7 +5,7 @@ VENV ?= .venv
 # Any build will do: TORCH=torch keeps one that is installed in VENV already.
 TORCH ?= torch==2.13.0
 # Joint steps of `make train`.
-STEPS ?= 400000
+STEPS ?= 300000
 # Further options of `make tables` and `make report`: TABLES=--quick takes minutes.
 TABLES ?=
 # Promises and options of `make prove`: PROVE=--quick takes minutes, PROVE="R1 R2" tries two.
@@ -22,6 +22,7 @@ help: ## list the targets
 install: $(STAMP) ## set up the virtual environment
 
 $(STAMP): setup.cfg pyproject.toml
+	@echo "setting up $(VENV): this takes a minute or two"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --upgrade pip
 	$(BIN)/python -m pip install -qq "$(TORCH)"
