@@ -153,7 +153,7 @@ def test_what_can_not_be_read_now_is_not_called_damaged(
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
-        patch.setattr(parquet, "read_table", refuse)
+        patch.setattr(parquet, "ParquetFile", refuse)
         if stops:
             with pytest.raises(OSError, match=os.strerror(number)) as caught:
                 store.read(series, span)
