@@ -6,7 +6,9 @@ import re
 import subprocess
 import sys
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import toy_envs
@@ -365,11 +367,16 @@ def test_bad_files(tmp_path, text, expected):
     [
         ("no_such_module_:make", "ModuleNotFoundError"),
         ("toy_envs:nothing", "unknown factory of toy_envs 'nothing': allowed are "),
+        ("area_search:AreaSearchEvn", "allowed are SCENES, .* did you mean 'AreaSearchEnv'"),
+        ("lazy_:make", "No module named .no_such_package_"),
         ("builtins:dict", "must make a pettingzoo.ParallelEnv"),
         ("builtins:int", "fails|must make"),
     ],
 )
-def test_bad_factories(env, expected):
+def test_bad_factories(env, expected, monkeypatch):
+    lazy = ModuleType("lazy_")
+    lazy.__getattr__ = lambda name: import_module("no_such_package_")
+    monkeypatch.setitem(sys.modules, "lazy_", lazy)
     with pytest.raises(UsageError, match=expected):
         env_factory(env, {"x": 1})
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 from area_search.scenes import SCENES, Scene, SceneError, get_scenes
@@ -119,20 +120,17 @@ def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:
     if env not in ENVIRONMENTS and os.getcwd() not in sys.path:
         # As python -m does: the console script would not find a module of the current folder.
         sys.path.insert(0, os.getcwd())
+    imported = None
     try:
         imported = import_module(module)
+        factory = getattr(imported, name)
     except (Exception, SystemExit) as error:
         if isinstance(error, SecondSignal):
             raise
-        raise UsageError(f"--env {env}: {type(error).__name__}: {error}") from error
-    factory = getattr(imported, name, None)
-    if factory is None:
-        known = [
-            one
-            for one, value in vars(imported).items()
-            if callable(value) and getattr(value, "__module__", None) == imported.__name__
-        ]
-        raise UsageError(f"--env {env}: {closest(f'factory of {module}', name, known)}")
+        said = f"{type(error).__name__}: {error}"
+        if imported is not None and isinstance(error, AttributeError):
+            said = closest(f"factory of {module}", name, _factories(imported))
+        raise UsageError(f"--env {env}: {said}") from error
 
     def make() -> Any:
         return factory(**env_kwargs)
@@ -153,6 +151,17 @@ def env_factory(env: str, env_kwargs: Mapping[str, Any]) -> Callable[[], Any]:
     with suppress(Exception):
         made.close()
     return make
+
+
+def _factories(module: ModuleType) -> list[str]:
+    """Name what a module says that it has to offer, or else what it defines itself."""
+    return getattr(module, "__all__", None) or [
+        name
+        for name, value in vars(module).items()
+        if callable(value)
+        and not name.startswith("_")
+        and getattr(value, "__module__", None) == module.__name__
+    ]
 
 
 def folder_name(env: str) -> str:
